@@ -1,0 +1,45 @@
+# Everything runs from .venv, which `make setup` builds from the hashed lock and nothing else.
+SHELL := /bin/bash
+PYTHON ?= python3
+BIN := .venv/bin
+DEMO ?= auto
+DEMO_FLAGS := $(if $(filter headless,$(DEMO)),--headless,)
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint check bench lock picture
+
+help:      ## this list
+	@grep -E '^[a-z-]+: .*## ' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: .venv/.ready  ## virtual environment with the locked packages and the bladecell command
+
+.venv/.ready: requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("bladecell needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+
+demo: setup  ## simulated cell + station: inspect blades, show verdicts (DEMO=headless: no screen)
+	$(BIN)/bladecell demo $(DEMO_FLAGS)
+
+test: setup lint  ## every check that .ci/run runs
+	$(BIN)/pytest
+
+lint: setup  ## style, types, direction of imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+check: test  ## the same as test
+
+bench: setup  ## accuracy and time of every stage, one table each
+	$(BIN)/python -m benchmarks
+
+picture: setup  ## redraw the picture of the screen in the README
+	$(BIN)/python -m tests.station.tui.picture docs/screen.png
+
+lock:      ## resolve the lock again (needs uv on PATH)
+	uv pip compile pyproject.toml --extra dev --extra bench --universal --generate-hashes \
+	  --no-header --no-emit-index-url --python-version 3.11 --quiet --output-file requirements.lock

@@ -1,0 +1,1 @@
+"""Drivers: bytes and registers to small values in physical units."""

@@ -1,0 +1,1 @@
+"""Sans-IO codecs, read by the drivers and by the simulators."""

@@ -1,0 +1,1 @@
+"""Geometry: arrays in, frozen results out. Measures; never decides."""

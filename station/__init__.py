@@ -1,0 +1,1 @@
+"""Station: decides, records and shows."""

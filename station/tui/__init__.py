@@ -1,0 +1,1 @@
+"""The operator screen: a client of the event stream. Data in, pixels out."""
