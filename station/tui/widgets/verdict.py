@@ -26,14 +26,14 @@ class Verdict(Canvas):
     verdict: str | None = None
 
     def on_mount(self) -> None:
-        self.display = False
+        self.add_class("-absent")
 
     def show(self, state: ScreenState) -> None:
         shown = state.verdict_shown
         word = shown.verdict if shown is not None else None
         if word != self.verdict:
             self.verdict = word
-            self.display = word is not None
+            self.set_class(word is None, "-absent")
             self.redraw()
 
     def draw(self, columns: int, rows: int) -> list[Strip]:
