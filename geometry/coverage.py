@@ -3,7 +3,32 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from geometry.types import Zone
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geometry.broken import Skin
+from geometry.errors import BadInput
+from geometry.nominal import ZONE_ORDER, Nominal
+from geometry.register import Alignment
+from geometry.repair import RepairVolume
+from geometry.transforms import apply
+from geometry.twin import Twin
+from geometry.types import Bools, Cloud, Floats, Ints, Mesh, Zone
+
+SAME_SIDE = 0.3  # least cosine between the direction of a side and the skin that a scan point lies on
+ON_PATCH_MM = 0.02  # the outer skin of a patch is the twin's; rounding and the nominal's own facets
+LEVELS = 3  # of division round a sample, in search of the largest empty disc
+
+
+def _spread_directions(count: int) -> Floats:
+    """Unit vectors (count, 3) spread evenly over the sphere: a Fibonacci lattice."""
+    index = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * index / count, np.pi * (1.0 + np.sqrt(5.0)) * index
+    across = np.sqrt(1.0 - z * z)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+
+
+SIDES = _spread_directions(32)
 
 
 class CoverageStatus(StrEnum):
@@ -15,6 +40,11 @@ class CoverageStatus(StrEnum):
 class CoverageSettings:
     min_fraction: float = 0.95
     max_gap_mm: float = 1.5
+    normal_mm: float = 0.5  # a scan point farther than this from the skin does not show it
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.min_fraction <= 1.0 and self.max_gap_mm > 0.0 and self.normal_mm > 0.0):
+            raise BadInput("coverage settings: a fraction in (0, 1], gaps and distances above zero")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,3 +57,155 @@ class ZoneCoverage:
     absent_fraction: float
     largest_gap_mm: float
     status: CoverageStatus
+
+
+class _Marks:
+    """What shows a part of the surface, asked for the distance to the nearest of them on the same side.
+
+    Sides are told by `SIDES` directions: a place sees the marks whose normals lie within about 70 deg of
+    the direction nearest to its own normal. At a thin edge the marks of the other side do not count.
+    """
+
+    def __init__(self, points_mm: Floats, normals: Floats) -> None:
+        self._points_mm, self._normals = points_mm, normals
+        self._trees: dict[int, cKDTree | None] = {}
+
+    def distance_mm(self, points_mm: Floats, normals: Floats) -> Floats:
+        """Distance (n,) from each place to the nearest mark on its side; infinite where there is none."""
+        side = (normals @ SIDES.T).argmax(axis=1)
+        distance_mm = np.full(len(points_mm), np.inf)
+        for index in np.unique(side):
+            tree = self._tree(int(index))
+            if tree is not None:
+                own = side == index
+                distance_mm[own] = tree.query(points_mm[own])[0]
+        return distance_mm
+
+    def _tree(self, side: int) -> cKDTree | None:
+        if side not in self._trees:
+            facing = self._normals @ SIDES[side] > SAME_SIDE
+            self._trees[side] = cKDTree(self._points_mm[facing]) if facing.any() else None
+        return self._trees[side]
+
+
+def measure_coverage(
+    cloud: Cloud,
+    alignment: Alignment,
+    nominal: Nominal,
+    twin: Twin | None,
+    repairs: RepairVolume | None,
+    settings: CoverageSettings,
+) -> tuple[ZoneCoverage, ...]:
+    """Coverage of every zone that has required surface, in the order of `ZONE_ORDER`.
+
+    Measured on uniform samples of the nominal, each of which stands for its area: a sample is seen if a
+    scan point lies on the same side of the part, within `normal_mm` of the skin (the twin's, or the
+    nominal's without one) and within half the permitted gap along it; absent if it belongs to the
+    outer skin of a patch. Repeated points add nothing, and fewer points never see more.
+    """
+    samples = nominal.samples
+    seen_mm, seen_normals = _seen_skin(cloud, alignment, nominal, twin, settings.normal_mm)
+    absent = _absent(samples.points_mm, twin, repairs, settings.max_gap_mm)
+    marks = _Marks(
+        np.concatenate([seen_mm, samples.points_mm[absent]]),
+        np.concatenate([seen_normals, samples.normals[absent]]),
+    )
+    empty_mm = marks.distance_mm(samples.points_mm, samples.normals)
+    rows = []
+    for index, zone in enumerate(ZONE_ORDER):
+        own = samples.zone == index
+        if zone is not Zone.OUTSIDE and own.any():
+            worst_mm = _largest_empty(nominal, np.flatnonzero(own & ~absent), empty_mm, marks)
+            rows.append(_row(zone, samples.area_mm2[own], empty_mm[own], absent[own], worst_mm, settings))
+    return tuple(rows)
+
+
+def _row(
+    zone: Zone, area_mm2: Floats, empty_mm: Floats, absent: Bools, worst_mm: float, settings: CoverageSettings
+) -> ZoneCoverage:
+    covered = empty_mm <= 0.5 * settings.max_gap_mm
+    fraction = float(area_mm2[covered].sum() / area_mm2.sum())
+    ok = fraction >= settings.min_fraction and 2.0 * worst_mm <= settings.max_gap_mm
+    return ZoneCoverage(
+        zone=zone,
+        covered_fraction=fraction,
+        absent_fraction=float(area_mm2[absent].sum() / area_mm2.sum()),
+        largest_gap_mm=2.0 * worst_mm,
+        status=CoverageStatus.SEEN if ok else CoverageStatus.UNSEEN,
+    )
+
+
+def _largest_empty(nominal: Nominal, own: Ints, empty_mm: Floats, marks: _Marks) -> float:
+    """Radius of the largest empty disc about the samples `own` and the skin between them.
+
+    The radius changes by no more than the way from one centre to the next, so only squares round a sample
+    that may hold a larger one are divided, `LEVELS` times into nine.
+    """
+    if not len(own):
+        return 0.0
+    centres_mm, normals = nominal.samples.points_mm[own], nominal.samples.normals[own]
+    radius_mm, half_mm = empty_mm[own], 0.75 * nominal.settings.sample_mm
+    largest_mm = float(radius_mm.max())
+    if not np.isfinite(largest_mm):
+        return 0.5 * float(np.linalg.norm(np.ptp(nominal.samples.points_mm, axis=0)))  # nothing of a side
+    for _ in range(LEVELS):
+        open_ = radius_mm + np.sqrt(2.0) * half_mm > largest_mm
+        half_mm /= 3.0
+        finer = nominal.closest(_nine(centres_mm[open_], normals[open_], 2.0 * half_mm))
+        required = nominal.airfoil_face[finer.face] & (finer.points_mm[:, 2] >= nominal.z_min_mm)
+        required &= finer.points_mm[:, 2] <= nominal.z_max_mm
+        centres_mm, normals = finer.points_mm[required], np.repeat(normals[open_], 9, axis=0)[required]
+        radius_mm = marks.distance_mm(centres_mm, normals)
+        largest_mm = max(largest_mm, float(radius_mm.max(initial=0.0)))
+    return largest_mm
+
+
+def _nine(centres_mm: Floats, normals: Floats, step_mm: float) -> Floats:
+    """Each centre and eight places round it in its tangent plane, centre after centre: (9 n, 3)."""
+    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normals, first)
+    u, v = (part.reshape(1, 9, 1) for part in np.meshgrid(*2 * ([-step_mm, 0.0, step_mm],)))
+    return np.asarray((centres_mm[:, None] + u * first[:, None] + v * second[:, None]).reshape(-1, 3))
+
+
+def _seen_skin(
+    cloud: Cloud, alignment: Alignment, nominal: Nominal, twin: Twin | None, normal_mm: float
+) -> tuple[Floats, Floats]:
+    """Where on the nominal (n, 3) the scan shows skin, and the nominal's normals there."""
+    foot = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
+    off_mm = foot.distance_mm
+    if twin is not None:
+        nearest = cKDTree(twin.mesh.vertices_mm - twin.displacement_mm).query(foot.points_mm)[1]
+        off_mm = off_mm - (twin.displacement_mm[nearest] * foot.normals).sum(axis=1)
+    shown = np.abs(off_mm) <= normal_mm
+    return foot.points_mm[shown], foot.normals[shown]
+
+
+def _on_twin(twin: Twin, points_mm: Floats) -> Floats:
+    """Where the twin has carried points (n, 3) of the nominal's surface."""
+    rest = Mesh(vertices_mm=twin.mesh.vertices_mm - twin.displacement_mm, faces=twin.mesh.faces)
+    corner = rest.faces[Skin(rest).closest(points_mm)[1]]
+    a, b, c = np.moveaxis(rest.vertices_mm[corner], 1, 0)
+    ab, ac, ap = b - a, c - a, points_mm - a
+    bb, bc, cc = ((x * y).sum(axis=1) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
+    pb, pc = (ap * ab).sum(axis=1), (ap * ac).sum(axis=1)
+    whole = np.maximum(bb * cc - bc * bc, 1e-300)
+    v, w = (cc * pb - bc * pc) / whole, (bb * pc - bc * pb) / whole
+    weights = np.stack([1.0 - v - w, v, w], axis=1)
+    return np.asarray(np.einsum("nc,nci->ni", weights, twin.mesh.vertices_mm[corner]))
+
+
+def _absent(points_mm: Floats, twin: Twin | None, repairs: RepairVolume | None, max_gap_mm: float) -> Bools:
+    """Which samples lie on the outer skin of a patch whose broken surface was seen without a larger gap."""
+    absent = np.zeros(len(points_mm), bool)
+    if twin is None or repairs is None:
+        return absent
+    on_twin_mm = _on_twin(twin, points_mm)
+    for patch in repairs.patches:
+        if patch.broken_gap_mm <= max_gap_mm:
+            low, high = patch.mesh.vertices_mm.min(axis=0), patch.mesh.vertices_mm.max(axis=0)
+            boxed = ((on_twin_mm >= low - ON_PATCH_MM) & (on_twin_mm <= high + ON_PATCH_MM)).all(axis=1)
+            distance_mm, face = Skin(patch.mesh).closest(on_twin_mm[boxed])
+            absent[boxed] |= (np.abs(distance_mm) <= ON_PATCH_MM) & patch.outer[face]
+    return absent

@@ -1,8 +1,48 @@
 """Twin minus scan: watertight patches with volume, for the repair shop."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from geometry.types import Measurand, Mesh, Zone
+import manifold3d
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from geometry.broken import BrokenSurface, Scan, Skin, find_broken_surface
+from geometry.damage import Damage, DamageKind
+from geometry.errors import BadInput, CannotRepair
+from geometry.kernels.implicit import blend_quadrics
+from geometry.kernels.implicit_solid import column_crossings, nodes_inside
+from geometry.register import Alignment
+from geometry.solid import check_solid, volume_mm3
+from geometry.transforms import apply, inverse
+from geometry.twin import Twin
+from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Mesh, Zone
+
+FAR = 1e3  # field value of a node whose side is known but whose distance is not
+COLLAR = 3  # nodes that the cut body reaches past the skin
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RepairSettings:
+    """How patches are made."""
+
+    max_gap_mm: float = 1.5  # a larger hole in the broken surface is not bridged
+    film_sigmas: float = 3.0  # closer than this to the twin, in sigmas of a scan point, is sound skin
+    min_points: int = 30  # on the broken surface
+    resolution: float = 60.0  # grid cells across the square root of the broken area
+    max_nodes: int = 12_000_000
+    sliver_fraction: float = 0.01  # pieces smaller than this share of the largest are dropped
+    agreement: float = 0.05  # largest difference of the two volumes, relative
+    agreement_mm3: float = 0.05  # and below this it does not count
+
+    def __post_init__(self) -> None:
+        if not (self.max_gap_mm > 0.0 and self.film_sigmas > 0.0 and self.resolution >= 5.0):
+            raise BadInput("repair settings: gap, film and resolution must be positive")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -12,9 +52,11 @@ class Patch:
     damage: int  # index into the damages it was made for
     zone: Zone
     mesh: Mesh
+    outer: Bools  # (faces,) on the twin's skin; the others lie on the broken surface
     watertight: bool
     volume_mm3: Measurand
     volume_check_mm3: float  # by an independent second method
+    broken_gap_mm: float  # diameter of the largest empty disc on the broken surface
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,3 +66,303 @@ class RepairVolume:
     patches: tuple[Patch, ...]
     volume_mm3: Measurand
     failures: dict[int, str]
+
+
+def find_repairs(
+    twin: Twin, cloud: Cloud, alignment: Alignment, damages: Sequence[Damage], settings: RepairSettings
+) -> RepairVolume:
+    """One patch, or the reason why there is none, for each damage with missing metal."""
+    missing = [i for i, damage in enumerate(damages) if damage.kind is DamageKind.MISSING]
+    patches: list[Patch] = []
+    failures: dict[int, str] = {}
+    if missing:
+        skin, solid = Skin(twin.mesh), _solid(twin.mesh).as_original()
+        scan = _scan(cloud, alignment, damages)
+    for i in missing:
+        try:
+            patches.append(_patch(i, damages[i], twin, skin, solid, scan, settings))
+        except CannotRepair as reason:
+            failures[i] = str(reason)
+    return RepairVolume(patches=tuple(patches), volume_mm3=_total(patches), failures=failures)
+
+
+def to_scan_frame(mesh: Mesh, alignment: Alignment) -> Mesh:
+    """The mesh as it lies on the scanned part: moved from the nominal frame back into the scan's."""
+    return Mesh(vertices_mm=apply(inverse(alignment.T_nominal_scan), mesh.vertices_mm), faces=mesh.faces)
+
+
+def _scan(cloud: Cloud, alignment: Alignment, damages: Sequence[Damage]) -> Scan:
+    points_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
+    flagged = np.zeros(len(cloud), bool)
+    for damage in damages:
+        flagged[damage.points] = True
+    return Scan(points_mm=points_mm, sigma_mm=cloud.sigma_mm, flagged=flagged)
+
+
+def _patch(
+    index: int, damage: Damage, twin: Twin, skin: Skin, solid: Any, scan: Scan, settings: RepairSettings
+) -> Patch:
+    broken = find_broken_surface(
+        skin, scan, damage.points, settings.film_sigmas, settings.max_gap_mm, settings.min_points
+    )
+    mesh, outer, dropped_mm3 = _lost_piece(solid, _cut_body(broken, skin, settings), settings)
+    gap_mm = _broken_gap(mesh, outer, broken)
+    if not gap_mm <= settings.max_gap_mm:
+        raise CannotRepair(f"a hole of {gap_mm:.2f} mm in the scan of the broken surface")
+    volume = volume_mm3(mesh)
+    check = _volume_by_columns(broken, skin)
+    allowed = max(settings.agreement * volume, settings.agreement_mm3)
+    if not abs(volume - check) <= allowed:
+        raise CannotRepair(f"two ways to its volume disagree: {volume:.3f} and {check:.3f} mm3")
+    sigma = _volume_sigma(mesh, outer, twin, broken, abs(volume - check), dropped_mm3)
+    return Patch(
+        damage=index,
+        zone=damage.zone,
+        mesh=mesh,
+        outer=outer,
+        watertight=True,
+        volume_mm3=Measurand(name="volume_mm3", value=volume, sigma=sigma, unit="mm3"),
+        volume_check_mm3=check,
+        broken_gap_mm=gap_mm,
+    )
+
+
+def _total(patches: Sequence[Patch]) -> Measurand:
+    """The sum; the sigmas add, because the twin's error is common to all."""
+    value = sum(patch.volume_mm3.value for patch in patches)
+    sigma = sum(patch.volume_mm3.sigma for patch in patches)
+    return Measurand(name="volume_mm3", value=value, sigma=sigma, unit="mm3")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Grid:
+    origin_mm: Floats  # (3,)
+    step_mm: float
+    shape: tuple[int, int, int]
+
+
+def _cut_body(broken: BrokenSurface, skin: Skin, settings: RepairSettings) -> Mesh:
+    """The closed surface around the lost metal: the broken surface, then well outside the twin.
+
+    The box grows until the lost metal ends inside it.
+    """
+    step_mm = float(np.sqrt(broken.area_mm2)) / settings.resolution
+    margin_mm = (COLLAR + 2) * step_mm
+    low, high = broken.raw_mm.min(axis=0) - margin_mm, broken.raw_mm.max(axis=0) + margin_mm
+    while True:
+        shape = np.ceil((high - low) / step_mm).astype(int) + 1
+        if float(np.prod(shape, dtype=float)) > settings.max_nodes:
+            raise CannotRepair("the broken surface does not close off the lost metal: seen incompletely")
+        grid = _Grid(origin_mm=low, step_mm=step_mm, shape=(int(shape[0]), int(shape[1]), int(shape[2])))
+        field, lost = _lost_field(grid, broken, skin, settings)
+        more = 0.3 * (high - low)
+        grow_low = np.array([lost.take(0, axis).any() for axis in range(3)])
+        grow_high = np.array([lost.take(-1, axis).any() for axis in range(3)])
+        if not (grow_low.any() or grow_high.any()):
+            return _zero_surface(field, grid)
+        low, high = low - grow_low * more, high + grow_high * more
+
+
+def _lost_field(
+    grid: _Grid, broken: BrokenSurface, skin: Skin, settings: RepairSettings
+) -> tuple[Floats, Bools]:
+    """A field that is positive where metal is lost, continued past the skin; and the lost nodes in the twin."""
+    reach_mm = 0.5 * settings.max_gap_mm + 2.0 * grid.step_mm
+    field, nearest_mm = blend_quadrics(
+        grid.shape,
+        grid.origin_mm,
+        grid.step_mm,
+        broken.points_mm,
+        broken.frames,
+        broken.bending,
+        1.2 * broken.spacing_mm,
+        reach_mm,
+    )
+    band = np.isfinite(nearest_mm)
+    inside = _inside(grid, skin)
+    _keep_sound_skin(field, nearest_mm, inside & band, grid, broken, skin)
+    lost = inside & ((band & (field > 0.0)) | _lost_beyond_band(inside & ~band, band & inside, field))
+    beyond = ndimage.binary_dilation(lost, np.ones((3, 3, 3), bool), COLLAR)
+    return np.where(band, field, np.where(lost | (beyond & ~inside), FAR, -FAR)), lost
+
+
+def _inside(grid: _Grid, skin: Skin) -> Bools:
+    start, height_mm = column_crossings(skin.triangles_mm, grid.origin_mm[:2], grid.step_mm, grid.shape[:2])
+    return np.asarray(nodes_inside(start, height_mm, float(grid.origin_mm[2]), grid.step_mm, grid.shape))
+
+
+def _keep_sound_skin(
+    field: Floats, nearest_mm: Floats, band: Bools, grid: _Grid, broken: BrokenSurface, skin: Skin
+) -> None:
+    """Where the broken surface runs out flat, end it: no film of metal is lost over points of the sound skin.
+
+    A node counts as lost only if it is about as near to the broken surface as to the sound skin, or deeper
+    than the film.
+    """
+    if not len(broken.sound_mm):
+        return
+    margin_mm = 1.5 * float(np.median(broken.spacing_mm))
+    at = np.argwhere(band & (field > 0.0) & (nearest_mm > margin_mm))
+    node_mm = grid.origin_mm + grid.step_mm * at
+    excess = margin_mm - (nearest_mm[tuple(at.T)] - cKDTree(broken.sound_mm).query(node_mm)[0])
+    at, node_mm, excess = at[excess < 0.0], node_mm[excess < 0.0], excess[excess < 0.0]
+    below = -skin.closest(node_mm)[0] - 1.5 * broken.film_mm
+    field[tuple(at.T)] = np.minimum(field[tuple(at.T)], np.maximum(excess, below))
+
+
+def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools:
+    """The free nodes in the twin, out of reach of the broken surface, that lie on its outer side.
+
+    Each connected region takes the side of the band nodes at its border. Raises `CannotRepair` if they
+    contradict each other: then there is a hole in the band.
+    """
+    region, count = ndimage.label(free)
+    votes = np.zeros((count + 1, 2))
+    for axis in range(3):
+        for a, b in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+            here = tuple(a if i == axis else slice(None) for i in range(3))
+            there = tuple(b if i == axis else slice(None) for i in range(3))
+            meet = (region[here] > 0) & band[there]
+            np.add.at(votes, (region[here][meet], (field[there][meet] > 0.0).astype(int)), 1.0)
+    lost = votes[:, 1] > votes[:, 0]
+    contradicting = votes[1:].min(axis=1).sum()
+    if not contradicting <= 0.02 * votes.sum():
+        raise CannotRepair(
+            "the broken surface is open: lost and sound metal are not separated by scan points"
+        )
+    return np.asarray(lost[region] & free)
+
+
+def _zero_surface(field: Floats, grid: _Grid) -> Mesh:
+    """The closed surface where the field is zero, its normals pointing to negative values."""
+    field = np.clip(field, -2.0 * grid.step_mm, 2.0 * grid.step_mm)
+    if not (field > 0.0).any():
+        raise CannotRepair("no metal is missing under the broken surface")
+    field[field == 0.0] = -1e-9 * grid.step_mm
+    padded = np.pad(field, 1, constant_values=-2.0 * grid.step_mm)
+    vertices, faces, _, _ = marching_cubes(padded.astype(np.float64), 0.0, gradient_direction="ascent")
+    return Mesh(
+        vertices_mm=grid.origin_mm + (vertices.astype(np.float64) - 1.0) * grid.step_mm,
+        faces=faces.astype(np.int64),
+    )
+
+
+def _solid(mesh: Mesh) -> Any:
+    solid = manifold3d.Manifold(
+        manifold3d.Mesh64(np.array(mesh.vertices_mm), np.array(mesh.faces, dtype=np.uint64))
+    )
+    if solid.status() != manifold3d.Error.NoError:
+        raise CannotRepair(f"a body is not a solid: {solid.status()}")
+    return solid
+
+
+def _lost_piece(solid: Any, body: Mesh, settings: RepairSettings) -> tuple[Mesh, Bools, float]:
+    """The twin within the cut body without slivers, which of its faces are the twin's, and what was dropped.
+
+    Components by graph search on the faces: manifold3d's own decomposition does not come back from
+    thousands of pieces.
+    """
+    if volume_mm3(body) < 0.0:
+        body = Mesh(vertices_mm=body.vertices_mm, faces=body.faces[:, ::-1])
+    raw = (solid ^ _solid(body)).to_mesh64()
+    vertices = np.asarray(raw.vert_properties)[:, :3]
+    faces = np.asarray(raw.tri_verts).astype(np.int64)
+    if not len(faces):
+        raise CannotRepair("no metal is missing under the broken surface")
+    component = _components(faces, len(vertices))
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
+    volumes = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+    kept = volumes >= settings.sliver_fraction * volumes.max()
+    own = kept[component]
+    used, compact = np.unique(faces[own], return_inverse=True)
+    mesh = Mesh(vertices_mm=vertices[used], faces=compact.reshape(-1, 3))
+    check_solid(mesh)
+    return mesh, _from_original(raw, solid.original_id())[own], float(np.abs(volumes[~kept]).sum())
+
+
+def _components(faces: Ints, count: int) -> Ints:
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1][faces[:, 0]])
+
+
+def _from_original(raw: Any, origin: int) -> Bools:
+    runs = np.asarray(raw.run_index, dtype=np.int64) // 3
+    mask = np.zeros(len(raw.tri_verts), bool)
+    for own, first, last in zip(raw.run_original_id, runs[:-1], runs[1:], strict=True):
+        mask[first:last] = own == origin
+    return mask
+
+
+def _face_areas(mesh: Mesh, faces: Bools) -> tuple[Floats, Floats]:
+    """Centroids (n, 3) and areas (n,) of the chosen faces."""
+    a, b, c = np.moveaxis(mesh.vertices_mm[mesh.faces[faces]], 1, 0)
+    return (a + b + c) / 3.0, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _broken_gap(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> float:
+    """Diameter of the largest disc on the patch's broken side that holds no scan point."""
+    middle_mm, area_mm2 = _face_areas(mesh, ~outer)
+    if not len(middle_mm):
+        raise CannotRepair("the patch has no broken side")
+    known_mm = np.concatenate([broken.raw_mm, broken.sound_mm])
+    return 2.0 * float(cKDTree(known_mm).query(middle_mm)[0].max())
+
+
+def _volume_sigma(
+    mesh: Mesh, outer: Bools, twin: Twin, broken: BrokenSurface, difference_mm3: float, dropped_mm3: float
+) -> float:
+    """Standard uncertainty of the volume, mm3.
+
+    The twin's error is taken as the same all over the lost skin; the noise of the scan points averages
+    out; what the two methods disagree by and what was dropped stand for the shape between the points.
+    """
+    middle_mm, area_mm2 = _face_areas(mesh, outer)
+    _, nearest = cKDTree(twin.mesh.vertices_mm).query(middle_mm)
+    from_twin = float((twin.sigma_mm[nearest] * area_mm2).sum())
+    from_noise = broken.sigma_mm * broken.area_mm2 / np.sqrt(len(broken.raw_mm))
+    return float(np.sqrt(from_twin**2 + from_noise**2 + difference_mm3**2 / 12.0 + dropped_mm3**2 / 3.0))
+
+
+def _volume_by_columns(broken: BrokenSurface, skin: Skin) -> float:
+    """The lost volume (mm3) by another way: columns along the way out, from the raw points to the twin's skin.
+
+    Uses neither normals nor the implicit surface nor the mesh of the patch: the height of the broken surface
+    in a column is that of a plane through the nearest raw points in projection, and a column counts where
+    it leaves the twin through lost skin.
+    """
+    R = _axes(broken.facing)
+    triangles = skin.triangles_mm @ R
+    raw, lost = broken.raw_mm @ R, broken.lost_mm @ R
+    ends = np.concatenate([raw, lost])
+    low, high = ends.min(axis=0) - 0.5, ends.max(axis=0) + 0.5
+    pitch_mm = float(np.sqrt(np.prod(high[:2] - low[:2]) / 40_000.0))
+    shape = (int((high[0] - low[0]) / pitch_mm) + 1, int((high[1] - low[1]) / pitch_mm) + 1)
+    start, height = column_crossings(triangles, low[:2], pitch_mm, shape)
+    column = np.repeat(np.arange(len(start) - 1), np.diff(start))[::2]
+    enter, leave = height[::2], height[1::2]
+    at = low[:2] + pitch_mm * np.column_stack([column // shape[1], column % shape[1]])
+    exits = np.column_stack([at, leave])
+    gone = cKDTree(lost).query(exits)[0] <= broken.lost_reach_mm
+    at, enter, leave = at[gone], enter[gone], leave[gone]
+    length = np.clip(leave - np.maximum(enter, _heights(at, raw)), 0.0, None)
+    return float(length.sum()) * pitch_mm**2
+
+
+def _axes(direction: Floats) -> Floats:
+    """A rotation (3, 3) whose third column is `direction`."""
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(direction, first), direction])
+
+
+def _heights(at_mm: Floats, points_mm: Floats) -> Floats:
+    """Height (n,) over each place (n, 2): a weighted plane through the 10 points nearest in projection."""
+    distance_mm, index = cKDTree(points_mm[:, :2]).query(at_mm, min(10, len(points_mm)))
+    weight = 1.0 / (distance_mm**2 + 1e-2 * distance_mm[:, -1:] ** 2)
+    off = points_mm[index, :2] - at_mm[:, None]
+    design = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
+    normal = np.einsum("nk,nki,nkj->nij", weight, design, design)
+    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    right = np.einsum("nk,nki,nk->ni", weight, design, points_mm[index, 2])
+    return np.asarray(np.linalg.solve(normal, right[..., None])[:, 0, 0])

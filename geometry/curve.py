@@ -1,0 +1,226 @@
+"""What is measured on a closed section curve, each definition in one function.
+
+The functions are pure and serve the nominal and the measured section alike. Curves (m, 2) are closed,
+counter-clockwise, the first point not repeated. An `Estimate` carries its growth with the displacement
+of every node along the outward normal, from which a sigma is propagated.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geometry.chart import outward_normals
+from geometry.errors import CannotMeasure
+from geometry.kernels.airfoil import farthest_pair, inscribed_circles
+from geometry.types import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """A value and its growth with each node's displacement along the outward normal, (m,)."""
+
+    value: float
+    gradient: Floats
+
+
+def node_shares(curve_mm: Floats) -> Floats:
+    """Arc length that each node of a closed curve stands for, (m,)."""
+    after = np.linalg.norm(np.roll(curve_mm, -1, axis=0) - curve_mm, axis=1)
+    shares: Floats = 0.5 * (after + np.roll(after, 1))
+    return shares
+
+
+def area(curve_mm: Floats) -> float:
+    """Enclosed area of a counter-clockwise closed polygon, mm2."""
+    x, y = curve_mm.T
+    return 0.5 * float(x @ np.roll(y, -1) - np.roll(x, -1) @ y)
+
+
+def centroid(curve_mm: Floats) -> Floats:
+    """Centroid (2,) of the enclosed area: the stacking point of the section."""
+    x, y = curve_mm.T
+    x1, y1 = np.roll(x, -1), np.roll(y, -1)
+    cross = x * y1 - x1 * y
+    moment = np.array([(x + x1) @ cross, (y + y1) @ cross])
+    return moment / (6.0 * area(curve_mm))
+
+
+def centroid_gradient(curve_mm: Floats) -> Floats:
+    """(2, m): growth of the centroid with each node's displacement; metal added away from it pulls."""
+    arm = (curve_mm - centroid(curve_mm)).T
+    return arm * node_shares(curve_mm) / area(curve_mm)
+
+
+def orientation(curve_mm: Floats, nominal_mm: Floats) -> Estimate:
+    """Turn (rad) counter-clockwise that takes the nominal onto the curve, once they share a centroid.
+
+    Best fit: the turn of least squared distance to the nominal, every mm of arc weighing the same.
+    Source: thesis 4.4.2, after Khameneifar and Feng (its reference 6).
+    """
+    normals = outward_normals(nominal_mm)
+    home = centroid(nominal_mm)
+    tree = cKDTree(nominal_mm)
+    weight = node_shares(curve_mm)
+    arm = curve_mm - centroid(curve_mm)
+    turn = 0.0
+    for _ in range(10):
+        c, s = np.cos(turn), np.sin(turn)
+        back = home + arm @ np.array([[c, -s], [s, c]])
+        near = tree.query(back)[1]
+        n = normals[near]
+        lever = n[:, 1] * (back[:, 0] - home[0]) - n[:, 0] * (back[:, 1] - home[1])
+        distance = ((back - nominal_mm[near]) * n).sum(axis=1)
+        step = float((weight * lever) @ distance) / float((weight * lever) @ lever)
+        turn += step
+        if abs(step) < 1e-9:
+            break
+    stiffness = float((weight * lever) @ lever)
+    pull = (weight * lever) @ n
+    return Estimate(value=turn, gradient=(weight * lever - pull @ centroid_gradient(curve_mm)) / stiffness)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Edge:
+    """One edge of the nominal section: nodes that belong to its zone and to its rounding."""
+
+    zone: Ints  # contiguous, in order, within 8 % of the perimeter from the edge point
+    arc: Ints  # of these, where the normal lies within 60 deg of the edge's own direction
+
+
+def edge(nominal_mm: Floats, tip: int) -> Edge:
+    """The edge about node `tip`.
+
+    Its direction halves the angle between the normals of the two sides, 4 % of the perimeter away.
+    """
+    m = len(nominal_mm)
+    share = node_shares(nominal_mm)
+    arc = np.cumsum(share) - share
+    away = (arc - arc[tip] + 0.5 * share.sum()) % share.sum() - 0.5 * share.sum()
+    order = (tip + np.arange(-m // 2, m // 2)) % m
+    zone = order[np.abs(away[order]) <= 0.08 * share.sum()]
+    normals = outward_normals(nominal_mm)[zone]
+    angle = np.unwrap(np.arctan2(normals[:, 1], normals[:, 0]))
+    flank = np.abs(away[zone]) <= 0.04 * share.sum()
+    middle = 0.5 * (angle[flank][0] + angle[flank][-1])
+    return Edge(zone=zone, arc=zone[np.abs(angle - middle) <= np.deg2rad(60.0)])
+
+
+def edge_radius(curve_mm: Floats, arc: Ints) -> Estimate:
+    """Radius of the least-squares circle through the nodes `arc` of an edge, every mm weighing the same.
+
+    `arc` spans +-60 deg of the nominal rounding (`edge`). Raises `CannotMeasure` for an edge that is flat.
+    """
+    points = curve_mm[arc]
+    weight = node_shares(curve_mm)[arc]
+    middle = points.mean(axis=0)
+    x = points - middle
+    ones = np.ones(len(x))
+    root = np.sqrt(weight)
+    start = np.linalg.lstsq(np.column_stack([2.0 * x, ones]) * root[:, None], (x * x).sum(axis=1) * root)[0]
+    centre = start[:2]
+    for _ in range(20):
+        ray = x - centre
+        length = np.linalg.norm(ray, axis=1)
+        columns = np.column_stack([ones, ray / length[:, None]])
+        normal = columns.T @ (columns * weight[:, None])
+        if not np.linalg.cond(normal) < 1e12:
+            raise CannotMeasure("the edge has no rounding")
+        pull = np.linalg.solve(normal, columns.T * weight)
+        radius = float(weight @ length / weight.sum())
+        step = pull @ (length - radius)
+        centre = centre + step[1:]
+        if float(np.abs(step).max()) < 1e-10:
+            break
+    gradient = np.zeros(len(curve_mm))
+    gradient[arc] = pull[0]
+    return Estimate(value=radius + float(step[0]), gradient=gradient)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Contact:
+    """Where a line across `direction` touches an edge from outside."""
+
+    point_mm: Floats
+    radius_mm: float  # of curvature
+    slope: Floats  # (m,): weights that give the slope of a node function along the arc there
+
+
+def _touch(curve_mm: Floats, node: int, direction: Floats) -> Contact:
+    """The contact near `node`, between nodes, by a parabola through 17 of them."""
+    m = len(curve_mm)
+    near = (node + np.arange(-8, 9)) % m
+    points = curve_mm[near]
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    arc -= arc[8]
+    inverse = np.linalg.pinv(np.vander(arc, 3, increasing=True))
+    _, linear, square = inverse @ (points @ direction)
+    curvature = -2.0 * float(square)
+    reach = float(arc[-1])
+    at = float(np.clip(linear / curvature, arc[0], reach)) if curvature > 1e-9 else 0.0
+    place = np.array([1.0, at, at * at]) @ inverse @ points
+    slope = np.zeros(m)
+    slope[near] = inverse[1] + 2.0 * at * inverse[2]
+    return Contact(point_mm=place, radius_mm=1.0 / max(curvature, 1.0 / 50.0), slope=slope)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Chord:
+    """Length (mm) and stagger (rad, of the line nose to tail against +X) of a section."""
+
+    length: Estimate
+    stagger: Estimate
+
+
+def chord(curve_mm: Floats, le: Edge, te: Edge) -> Chord:
+    """The caliper chord: the largest distance between two points of the section (largest Feret diameter).
+
+    Its ends lie in the zones of the two edges; the nose is the one at the leading edge.
+    """
+    nose, tail = farthest_pair(curve_mm, le.zone, te.zone)
+    ends = curve_mm[tail] - curve_mm[nose]
+    for _ in range(4):
+        along = ends / np.linalg.norm(ends)
+        front, back = _touch(curve_mm, nose, -along), _touch(curve_mm, tail, along)
+        ends = back.point_mm - front.point_mm
+    length = float(np.linalg.norm(ends))
+    normals = outward_normals(curve_mm)
+    gradient = np.zeros(len(curve_mm))
+    gradient[nose] = -float(normals[nose] @ along)
+    gradient[tail] = float(normals[tail] @ along)
+    lever = length - front.radius_mm - back.radius_mm
+    swing = (back.radius_mm * back.slope + front.radius_mm * front.slope) / lever
+    angle = float(np.arctan2(ends[1], ends[0]))
+    return Chord(
+        length=Estimate(value=length, gradient=gradient), stagger=Estimate(value=angle, gradient=swing)
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Thick:
+    """Nodes about the thickest part of the nominal section, on its two sides."""
+
+    first: Ints
+    second: Ints
+
+
+def thick_part(nominal_mm: Floats, le: int) -> Thick:
+    """Where the nominal is at least 95 % of its maximum thickness."""
+    m = len(nominal_mm)
+    margin = m // 40
+    first = np.arange(margin, le - margin)
+    second = np.arange(le + margin, m - margin)
+    radius, contact = inscribed_circles(nominal_mm, outward_normals(nominal_mm), first, second)
+    near = radius >= 0.95 * radius.max()
+    return Thick(
+        first=first[near], second=np.arange(contact[near].min() - margin, contact[near].max() + margin + 1)
+    )
+
+
+def max_thickness(curve_mm: Floats, thick: Thick) -> Estimate:
+    """Diameter of the largest inscribed circle; both of its contacts push it."""
+    radius, contact = inscribed_circles(curve_mm, outward_normals(curve_mm), thick.first, thick.second)
+    best = int(np.argmax(radius))
+    gradient = np.zeros(len(curve_mm))
+    gradient[[thick.first[best], contact[best]]] = 1.0
+    return Estimate(value=2.0 * float(radius[best]), gradient=gradient)

@@ -1,0 +1,316 @@
+"""Cloud near a plane -> the reconstructed section profile, with its covariance and its gaps.
+
+The profile is the nominal section, moved rigidly as the part was, plus a smooth deviation along its
+normals. The deviation is a cubic tensor spline over arc length and a band of neighbouring z, penalised
+by its curvature in both directions; how strongly is estimated from the data (restricted maximum
+likelihood), apart for the edges, which erode, and the sides. What has no points is a gap, never bridged.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.chart import (
+    NODES,
+    Chart,
+    Motion,
+    SectionSettings,
+    edge_width,
+    find_motion,
+    outward_normals,
+    rigid_columns,
+    unroll,
+)
+from geometry.errors import CannotMeasure
+from geometry.kernels.profile import cubic_weights
+from geometry.kernels.profile_spline import (
+    Penalty,
+    SplineFit,
+    Sums,
+    curvature_penalty,
+    fit_spline,
+    gather,
+    solve,
+)
+from geometry.nominal import Nominal
+from geometry.types import Bools, Floats
+
+_PILOT_POINTS = 20_000  # of a band, to tell outliers
+_BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # a start: curvature of sides, of edges, along the span
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Knots:
+    """Where the deviation spline of one band has its coefficients: p along the arc, q across."""
+
+    p: int
+    q: int
+    low_mm: float
+    step_mm: float
+
+    def u(self, node: Floats) -> Floats:
+        """Knot spans of node coordinates."""
+        return node * (self.p / NODES) % self.p
+
+    def v(self, z_mm: Floats) -> Floats:
+        """Knot spans of heights."""
+        return (z_mm - self.low_mm) / self.step_mm
+
+    def weights(self, gradients: Floats, z_mm: float) -> Floats:
+        """Weights (p, q, n) of the coefficients in n functions (n, NODES) of the node displacements."""
+        u = self.u(np.arange(NODES, dtype=np.float64))
+        span = u.astype(np.int64)
+        part = cubic_weights(u, span)
+        along = np.zeros((self.p, len(gradients)))
+        for a in range(4):
+            np.add.at(along, (span + a) % self.p, (part[:, a] * gradients).T)
+        v = self.v(np.array([z_mm]))
+        first = np.clip(v.astype(np.int64), 0, self.q - 4)
+        across = np.zeros(self.q)
+        across[first[0] : first[0] + 4] = cubic_weights(v, first)[0]
+        weights: Floats = along[:, None, :] * across[:, None]
+        return weights
+
+
+def place_knots(chart: Chart, settings: SectionSettings) -> Knots:
+    """Knots that crowd at the edges as the nodes do, `knot_mm` apart on the sides."""
+    half = chart.perimeter_mm / 2.0
+    refined = half + 1.77 * (settings.edge_refinement - 1.0) * edge_width(half, settings)
+    p = 2 * max(8, round(refined / settings.knot_mm))
+    low, high = float(chart.z_mm[0]), float(chart.z_mm[-1])
+    spans = max(1, round((high - low) / settings.z_knot_mm))
+    return Knots(p=min(p, NODES // 4), q=spans + 3, low_mm=low, step_mm=(high - low) / spans)
+
+
+def _penalty(chart: Chart, knots: Knots, settings: SectionSettings) -> Penalty:
+    """Curvature along the arc, apart for sides (0) and edges (1), and across."""
+    spans = np.arange(knots.p, dtype=np.float64)
+    centre = chart.arc_at((spans - 1.0) % knots.p * (NODES / knots.p))
+    leading = chart.arc_mm[NODES // 2]
+    trailing = np.minimum(centre, chart.perimeter_mm - centre)
+    reach = 1.5 * edge_width(chart.perimeter_mm / 2.0, settings)
+    group = (np.minimum(np.abs(centre - leading), trailing) < reach).astype(np.int64)
+    return curvature_penalty(centre, chart.perimeter_mm, group, knots.q, knots.step_mm)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gap:
+    """An arc of the section without points, from `start_mm` on; it may run over the trailing edge."""
+
+    start_mm: float
+    width_mm: float
+    in_damage: bool  # damaged points border it: metal lost or bent there, and seen to be
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Profile:
+    """The reconstructed section: NODES nodes that correspond to those of the chart's nominal curve."""
+
+    chart: Chart
+    curve_mm: Floats  # (NODES, 2) nominal frame; inside a gap it is no measurement
+    deviation_mm: Floats  # (NODES,) signed distance to the nominal section, positive outside
+    gaps: tuple[Gap, ...]
+    noise_mm: float  # standard deviation of a typical point about the profile, in the plane
+    knots: Knots
+    fit: SplineFit
+    columns: Floats  # (NODES, 6) of the fit's free part at the nodes
+
+    def open_nodes(self, damaged: bool | None = None) -> Bools:
+        """Nodes inside a gap: any, or only those inside gaps of damage (or of no damage)."""
+        arc = self.chart.arc_mm[:-1]
+        inside = np.zeros(NODES, bool)
+        for gap in self.gaps:
+            if damaged is None or gap.in_damage == damaged:
+                inside |= (arc - gap.start_mm) % self.chart.perimeter_mm <= gap.width_mm
+        return inside
+
+    def covariance(self, gradients: Floats) -> Floats:
+        """Covariance (n, n) of n linear functions (n, NODES) of the nodes' normal displacements."""
+        spline = self.knots.weights(gradients, self.z_mm)
+        return self.fit.covariance(spline, self.columns.T @ gradients.T)
+
+    def pose_gradient(self, gradients: Floats, pivot_mm: Floats) -> Floats:
+        """(n, 6): growth of the same functions with a pose twist of the part about `pivot_mm`."""
+        place = np.column_stack([self.curve_mm, np.full(NODES, self.z_mm)]) - pivot_mm
+        normals = outward_normals(self.curve_mm)
+        slope = -(normals * self.chart.growth()).sum(axis=1)
+        push = np.column_stack([normals, slope])
+        return gradients @ np.hstack([np.cross(place, push), push])
+
+    @property
+    def z_mm(self) -> float:
+        return self.chart.section_z_mm
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scan:
+    """The scan points in the nominal frame."""
+
+    points_mm: Floats  # (n, 3)
+    sigma_mm: Floats  # (n,)
+    mask: Bools  # (n,) True = damaged
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Band:
+    """Sound points near a section, taken back onto the chart."""
+
+    node: Floats  # (n,) node coordinate
+    z_mm: Floats
+    deviation_mm: Floats
+    sigma_mm: Floats
+    columns: Floats  # (n, 6) the rigid part
+
+    def sums(self, keep: Bools, knots: Knots, penalty: Penalty) -> Sums:
+        """Weighted sums of some points, with a weak prior on the rigid part: `find_motion` has taken most."""
+        u, v = knots.u(self.node[keep]), knots.v(self.z_mm[keep])
+        weight = self.sigma_mm[keep] ** -2.0
+        sums = gather(u, v, self.deviation_mm[keep], weight, self.columns[keep], penalty.layout)
+        return replace(sums, free=sums.free + np.diag(np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0))
+
+    def residual(self, fit: SplineFit, knots: Knots) -> Floats:
+        """Distance from the fit in units of each point's sigma."""
+        fitted = fit.values(knots.u(self.node), knots.v(self.z_mm), self.columns)
+        residual: Floats = np.abs(self.deviation_mm - fitted) / self.sigma_mm
+        return residual
+
+
+def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
+    """The profile in the chart's plane. Damaged points take no part.
+
+    Raises `CannotMeasure` when too few sound points lie near the plane.
+    """
+    z = scan.points_mm[:, 2]
+    inside = (z >= chart.z_mm[0]) & (z <= chart.z_mm[-1]) & ~scan.mask
+    if np.count_nonzero(inside) < settings.min_points:
+        raise CannotMeasure(f"no sound points within {settings.band_mm:g} mm of the plane")
+    sound = scan.points_mm[inside]
+    motion = find_motion(chart, sound)
+    band = _onto_chart(sound, scan.sigma_mm[inside], chart, motion, settings)
+    if len(band.node) < settings.min_points:
+        raise CannotMeasure("no sound points near the nominal section")
+    knots = place_knots(chart, settings)
+    keep, fit = _robust_fit(band, knots, _penalty(chart, knots, settings), settings)
+    near = keep & (np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0)
+    gaps = find_gaps(chart, chart.arc_at(band.node[near]), settings.max_gap_mm)
+    return _profile(chart, motion, knots, fit, gaps, float(np.median(band.sigma_mm)))
+
+
+def _onto_chart(
+    points_mm: Floats, sigma_mm: Floats, chart: Chart, motion: Motion, settings: SectionSettings
+) -> Band:
+    """The points within `capture_mm` of the moved nominal."""
+    back = motion.undo(points_mm)
+    foot = chart.project(back)
+    near = np.abs(foot[:, 1]) <= settings.capture_mm
+    height = (back[near, 2] - chart.section_z_mm) / settings.band_mm
+    return Band(
+        node=foot[near, 0],
+        z_mm=back[near, 2],
+        deviation_mm=foot[near, 1],
+        sigma_mm=sigma_mm[near],
+        columns=rigid_columns(back[near], foot[near, 2:], motion.pivot_mm, height),
+    )
+
+
+def _robust_fit(
+    band: Band, knots: Knots, penalty: Penalty, settings: SectionSettings
+) -> tuple[Bools, SplineFit]:
+    """Which points the profile passes through, and the fit to them.
+
+    What is kept is decided on a share of the points and a fixed smoothness; the last fit takes them all.
+    """
+    start = _BENDING_PER_MM**-2.0
+    some = np.zeros(len(band.node), bool)
+    some[:: max(1, len(some) // _PILOT_POINTS)] = True
+    keep = np.ones_like(some)
+    for limit in (2.0 * settings.outlier, settings.outlier):
+        residual = band.residual(solve(band.sums(keep & some, knots, penalty), penalty, start), knots)
+        keep = residual <= limit * 1.4826 * np.median(residual)
+    return keep, fit_spline(band.sums(keep, knots, penalty), penalty, start)
+
+
+def _profile(
+    chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, gaps: tuple[Gap, ...], sigma_mm: float
+) -> Profile:
+    """The curve of a fit, taken back to where the part is."""
+    normals = outward_normals(chart.curve_mm)
+    columns = rigid_columns(chart.curve_mm, normals, motion.pivot_mm, np.zeros(NODES))
+    height = np.full(NODES, chart.section_z_mm)
+    deviation = fit.values(knots.u(np.arange(NODES, dtype=np.float64)), knots.v(height), columns)
+    curve = motion.do(chart.curve_mm + normals * deviation[:, None])
+    return Profile(
+        chart=chart,
+        curve_mm=curve,
+        deviation_mm=chart.project(np.column_stack([curve, height]))[:, 1],
+        gaps=gaps,
+        noise_mm=float(np.sqrt(fit.scale)) * sigma_mm,
+        knots=knots,
+        fit=fit,
+        columns=columns,
+    )
+
+
+def whole_gap(chart: Chart) -> tuple[Gap, ...]:
+    """The one gap of a section without points."""
+    return (Gap(start_mm=0.0, width_mm=chart.perimeter_mm, in_damage=False),)
+
+
+def find_gaps(chart: Chart, arc_mm: Floats, max_gap_mm: float) -> tuple[Gap, ...]:
+    """The arcs wider than `max_gap_mm` between neighbouring points at `arc_mm` (n,), in order."""
+    if len(arc_mm) == 0:
+        return whole_gap(chart)
+    arc = np.sort(arc_mm)
+    width = np.diff(arc, append=arc[0] + chart.perimeter_mm)
+    wide = np.flatnonzero(~(width <= max_gap_mm))
+    return tuple(Gap(start_mm=float(arc[i]), width_mm=float(width[i]), in_damage=False) for i in wide)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Surroundings:
+    """Scan points about a section, unrolled: arc, height over the plane, damaged or not."""
+
+    perimeter_mm: float
+    arc_mm: Floats
+    height_mm: Floats
+    damaged: Bools
+
+    def meets_damage(self, arc_mm: float, width_mm: float) -> bool:
+        """Along the span from this arc, up and down, what comes first is mostly damage.
+
+        A side without points is as good, so that a broken-off tip is seen from below.
+        """
+        half = 0.5 * self.perimeter_mm
+        column = np.abs((self.arc_mm - arc_mm + half) % self.perimeter_mm - half) <= width_mm / 2.0
+        height, damaged = self.height_mm[column], self.damaged[column]
+        sides = []
+        for side in (height < 0.0, height >= 0.0):
+            nearest = np.argsort(np.abs(height[side]))[:10]
+            if len(nearest) >= 5:
+                sides.append(float(damaged[side][nearest].mean()) >= 0.5)
+        return bool(sides) and all(sides)
+
+
+def explain_gaps(
+    gaps: tuple[Gap, ...], scan: Scan, nominal: Nominal, z_mm: float, settings: SectionSettings
+) -> tuple[Gap, ...]:
+    """The gaps, those marked that damage borders on most of their width: the broken surface or its rim."""
+    if not gaps or not scan.mask.any():
+        return gaps
+    chart = unroll(nominal, z_mm, settings.damage_reach_mm, settings)
+    z = scan.points_mm[:, 2]
+    inside = (z >= chart.z_mm[0]) & (z <= chart.z_mm[-1])
+    around = Surroundings(
+        perimeter_mm=chart.perimeter_mm,
+        arc_mm=chart.arc_at(chart.project(scan.points_mm[inside])[:, 0]),
+        height_mm=z[inside] - z_mm,
+        damaged=scan.mask[inside],
+    )
+    return tuple(replace(gap, in_damage=_in_damage(gap, around, settings.max_gap_mm)) for gap in gaps)
+
+
+def _in_damage(gap: Gap, around: Surroundings, width_mm: float) -> bool:
+    """At least half of the gap's columns, about `width_mm` wide, meet damage."""
+    count = max(1, round(gap.width_mm / width_mm))
+    centres = gap.start_mm + gap.width_mm * (np.arange(count) + 0.5) / count
+    return 2 * sum(around.meets_damage(float(centre), width_mm) for centre in centres) >= count

@@ -1,0 +1,53 @@
+"""The grid's neighbours against brute force and scipy's tree."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from geometry.kernels.neighbours import counting_sort, k_nearest
+
+
+def slow_distances(points, k):
+    return np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, :k]
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 60), k=st.integers(1, 60), flat=st.booleans())
+def test_small_clouds_match_brute_force(seed, count, k, flat):
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * ([1.0, 1.0, 0.0] if flat else 1.0)
+    k = min(k, count)
+    indices, distances = k_nearest(points, k)
+    assert np.allclose(distances, slow_distances(points, k), atol=1e-12)
+    assert (indices[:, 0] == np.arange(count)).all()
+    assert np.allclose(np.linalg.norm(points[indices] - points[:, None], axis=2), distances, atol=1e-12)
+
+
+def test_a_surface_of_uneven_density_with_a_far_cluster_matches_a_tree():
+    rng = np.random.default_rng(3)
+    sheet = np.column_stack([rng.exponential(10.0, 5000), rng.uniform(0, 100, 5000), rng.normal(scale=0.01, size=5000)])
+    points = np.concatenate([sheet, rng.normal(scale=0.1, size=(40, 3)) + [500.0, -300.0, 80.0]])
+    _, distances = k_nearest(points, 16)
+    assert np.abs(distances - cKDTree(points).query(points, 16)[0]).max() < 1e-12
+
+
+def test_duplicates_keep_the_point_itself_first():
+    points = np.repeat(np.random.default_rng(4).normal(size=(20, 3)), 4, axis=0)
+    indices, distances = k_nearest(points, 5)
+    assert (indices[:, 0] == np.arange(80)).all()
+    assert (distances[:, :4] == 0.0).all()
+    assert all(len(set(row)) == 5 for row in indices)
+
+
+@pytest.mark.parametrize("k", [0, 6])
+def test_an_impossible_k_is_refused(k):
+    with pytest.raises(ValueError, match="neighbours asked"):
+        k_nearest(np.zeros((5, 3)), k)
+
+
+def test_counting_sort_is_stable():
+    keys = np.array([2, 0, 2, 1, 0])
+    starts, order = counting_sort(keys, 4)
+    assert starts.tolist() == [0, 2, 3, 5, 5]
+    assert order.tolist() == np.argsort(keys, kind="stable").tolist()
