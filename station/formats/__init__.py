@@ -1,0 +1,1 @@
+"""File formats of points and meshes: bytes in, arrays out, and back."""

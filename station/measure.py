@@ -1,0 +1,236 @@
+"""Views -> Measurement: the whole geometry chain, one verb a line.
+
+The measurement is a fold: `absorb` each view as it lands, `conclude` after the last. Live, replayed and
+inspected parts go through the same functions, hence equal numbers from equal points. Time is an argument:
+`clock` gives seconds, `progress` hears the name of each step as it begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+
+from geometry.airfoil import Section, measure_sections, with_damages
+from geometry.clean import CleanSettings, clean
+from geometry.coverage import measure_coverage
+from geometry.damage import Damage, DamageKind, DamageSettings, detection_limit, find_damages
+from geometry.errors import CannotMeasure
+from geometry.fuse import fuse, overlaps
+from geometry.nominal import Nominal
+from geometry.register import Alignment, RegisterSettings, mask_damage, register
+from geometry.repair import RepairVolume, find_repairs
+from geometry.transforms import apply
+from geometry.twin import Twin, TwinSettings, fit_twin
+from geometry.types import Bools, Cloud, Floats, Measured, NotMeasured, View, Zone
+from station.measurement import NO_TWIN, Measurement
+from station.recipe import Recipe
+
+T = TypeVar("T")
+Clock = Callable[[], float]
+Progress = Callable[[str], None]
+
+DAMAGE_MARGIN_MM = 0.5  # a section this near to a damage needs points that lie on it
+VIEW_BIAS_SIGMAS = 3.0  # a view that lies farther off the others was not taken where the table said
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Views:
+    """The views of one part so far."""
+
+    views: tuple[View, ...] = ()
+
+
+def absorb(state: Views, view: View) -> Views:
+    """The state with one more view."""
+    return Views(views=(*state.views, view))
+
+
+def conclude(state: Views, recipe: Recipe, clock: Clock, progress: Progress) -> Measurement:
+    """The measurement of all views, taken in the order of their indices."""
+    if recipe.axis is None:
+        raise ValueError("views cannot be merged without the calibration of the turntable's axis")
+    run = Run(clock=clock, progress=progress)
+    views = sorted(state.views, key=lambda view: view.index)
+    cloud = run.step("fuse", fused, views, recipe)
+    points = sum(len(view.points_mm) for view in views)
+    return run.measurement(points) if cloud is None else measured(cloud, recipe, run)
+
+
+def measure_cloud(cloud: Cloud, recipe: Recipe, clock: Clock, progress: Progress) -> Measurement:
+    """The measurement of a cloud that was merged elsewhere."""
+    return measured(cloud, recipe, Run(clock=clock, progress=progress))
+
+
+def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
+    """The procedure. A step that lacks what an earlier one should have given does not run."""
+    nominal = recipe.nominal
+    points = run.step("clean", clean, cloud, CleanSettings())
+    alignment = run.step("register", register, points, nominal, RegisterSettings())
+    mask = run.step("mask", mask_damage, points, alignment, nominal)
+    twin = run.step("twin", fit_twin, points, mask, alignment, nominal, TwinSettings())
+    damages = run.step("damage", find_damages, points, mask, alignment, nominal, twin, DamageSettings())
+    detection = run.step("detection", detection_limit, points, twin, DamageSettings())
+    repairs = run.step("repair", find_repairs, twin, points, alignment, damages, recipe.repair_settings)
+    sections = run.step(
+        "sections", inspected, points, mask, alignment, recipe, twin=twin, damages=damages, repairs=repairs
+    )
+    zones = run.step(
+        "coverage",
+        measure_coverage,
+        points,
+        alignment,
+        nominal,
+        twin=twin,
+        repairs=repairs,
+        settings=recipe.coverage_settings,
+    )
+    shown = run.step("deviation", deviations, points, alignment, nominal)
+    found = run.measurement(len(cloud))
+    return replace(
+        found,
+        alignment=alignment,
+        aligned_mm=shown[0] if shown else found.aligned_mm,
+        deviation_mm=shown[1] if shown else found.deviation_mm,
+        sections=sections or (),
+        outlines=recipe.outlines,
+        twin_mesh=twin.mesh if twin else None,
+        form_mm=twin.form_mm if twin else NO_TWIN,
+        residual_mm=twin.noise_mm if twin else None,
+        damages=None if damages is None else with_volumes(damages, repairs),
+        detection_mm=detection or {},
+        repairs=repairs,
+        zones=zones or (),
+    )
+
+
+@dataclass(slots=True, kw_only=True)
+class Run:
+    """The steps of one measurement as they are made: how long each took, and which could not be."""
+
+    clock: Clock
+    progress: Progress
+    failures: dict[str, str] = field(default_factory=dict)
+    timing_s: dict[str, float] = field(default_factory=dict)
+
+    def step(self, name: str, verb: Callable[..., T], *needs: object, **options: object) -> T | None:
+        """What `verb` gives, or None if one of its `needs` is missing or it cannot measure."""
+        if any(need is None for need in needs):
+            return None
+        self.progress(name)
+        begun_s = self.clock()
+        try:
+            return verb(*needs, **options)
+        except CannotMeasure as why:
+            self.failures[name] = str(why)
+            return None
+        finally:
+            self.timing_s[name] = self.clock() - begun_s
+
+    def measurement(self, points: int) -> Measurement:
+        """A measurement with nothing but what went wrong and how long it took."""
+        return Measurement(points=points, failures=dict(self.failures), timing_s=dict(self.timing_s))
+
+
+def fused(views: Sequence[View], recipe: Recipe) -> Cloud:
+    """The views as one cloud; raises `CannotMeasure` if one of them disagrees with the others."""
+    sigma_mm = recipe.plan.measurement.sigma_mm
+    assert recipe.axis is not None
+    cloud = fuse(views, recipe.axis, sigma_mm)
+    for overlap in overlaps(cloud):
+        if not overlap.bias_mm <= VIEW_BIAS_SIGMAS * sigma_mm:
+            raise CannotMeasure(f"view {overlap.view} lies {overlap.bias_mm:.3f} mm off the others")
+    return cloud
+
+
+def as_cloud(points_mm: Floats, sigma_mm: float) -> Cloud:
+    """Points of a merged file as a cloud."""
+    count = len(points_mm)
+    return Cloud(points_mm=points_mm, sigma_mm=np.full(count, sigma_mm), view=np.zeros(count, np.int64))
+
+
+def inspected(
+    points: Cloud,
+    mask: Bools,
+    alignment: Alignment,
+    recipe: Recipe,
+    *,
+    twin: Twin | None,
+    damages: Sequence[Damage] | None,
+    repairs: RepairVolume | None,
+) -> tuple[Section, ...]:
+    """The sections, measured on all metal that no limit of damage judges."""
+    if twin is not None and damages is not None:
+        mask = damaged_metal(mask, twin, damages)
+    sections = measure_sections(
+        points, mask, alignment, recipe.nominal, recipe.plan.sections.z_mm, recipe.section_settings
+    )
+    if damages is None:
+        return sections
+    spans = [
+        damaged_span_mm(index, damage, points, alignment, recipe.nominal, repairs)
+        for index, damage in enumerate(damages)
+        if damage.kind is not DamageKind.DEFORMATION
+    ]
+    return tuple(settled(section, touches(section.z_mm, spans)) for section in sections)
+
+
+def damaged_metal(mask: Bools, twin: Twin, damages: Sequence[Damage]) -> Bools:
+    """The scan points that limits of damage judge, and what neither twin nor nominal explains.
+
+    Deformed metal counts as sound, for its limits are those of sections and form."""
+    damaged = mask & ~twin.sound
+    for damage in damages:
+        damaged[damage.points] = damage.kind is not DamageKind.DEFORMATION
+    return damaged
+
+
+def damaged_span_mm(
+    index: int,
+    damage: Damage,
+    points: Cloud,
+    alignment: Alignment,
+    nominal: Nominal,
+    repairs: RepairVolume | None,
+) -> tuple[float, float]:
+    """The heights between which a damage lies: its points, its patch, and up to the end of a lost tip."""
+    z_mm = apply(alignment.T_nominal_scan, points.points_mm[damage.points])[:, 2]
+    for patch in repairs.patches if repairs else ():
+        if patch.damage == index:
+            z_mm = np.concatenate([z_mm, patch.mesh.vertices_mm[:, 2]])
+    if damage.zone is Zone.TIP and damage.kind is DamageKind.MISSING:
+        z_mm = np.append(z_mm, nominal.z_max_mm)
+    return float(z_mm.min(initial=np.inf)), float(z_mm.max(initial=-np.inf))
+
+
+def touches(z_mm: float, spans_mm: Sequence[tuple[float, float]]) -> bool:
+    """Whether a plane passes through a damage or closely by."""
+    return any(low - DAMAGE_MARGIN_MM <= z_mm <= high + DAMAGE_MARGIN_MM for low, high in spans_mm)
+
+
+def settled(section: Section, touched: bool) -> Section:
+    """The section once the damages are known: only a damage that was found excuses what is missing."""
+    if touched:
+        return with_damages(section, touched)
+    measurands = {name: unexcused(measured) for name, measured in section.measurands.items()}
+    return replace(section, measurands=measurands)
+
+
+def unexcused(measured: Measured) -> Measured:
+    if isinstance(measured, NotMeasured) and measured.in_damage:
+        return NotMeasured(reason=f"{measured.reason}, but no damage was found there")
+    return measured
+
+
+def with_volumes(damages: Sequence[Damage], repairs: RepairVolume | None) -> tuple[Damage, ...]:
+    """The damages, the volume of each taken from its patch where it has one."""
+    volumes = {patch.damage: patch.volume_mm3 for patch in repairs.patches} if repairs else {}
+    return tuple(replace(d, volume_mm3=volumes.get(i, d.volume_mm3)) for i, d in enumerate(damages))
+
+
+def deviations(points: Cloud, alignment: Alignment, nominal: Nominal) -> tuple[Floats, Floats]:
+    """The points in the nominal frame (n, 3) and their signed distance (n,) to the nominal."""
+    aligned_mm = apply(alignment.T_nominal_scan, points.points_mm)
+    return aligned_mm, nominal.closest(aligned_mm).distance_mm

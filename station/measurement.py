@@ -1,0 +1,61 @@
+"""All that the geometry found out about one part, or why it could not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from geometry.types import Floats, Measured, NotMeasured, Zone
+
+if TYPE_CHECKING:  # the rooms behind these types are heavy, and who only judges or shows needs none of them
+    from geometry.airfoil import Section
+    from geometry.coverage import ZoneCoverage
+    from geometry.damage import Damage
+    from geometry.register import Alignment
+    from geometry.repair import RepairVolume
+    from geometry.types import Mesh
+
+NO_POINTS = np.empty((0, 3))
+NO_VALUES = np.empty(0)
+NO_TWIN = NotMeasured(reason="there is no damage-free twin")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outline:
+    """The nominal section curve at `z_mm`: closed, counter-clockwise, nominal frame."""
+
+    z_mm: float
+    curve_mm: Floats  # (m, 2)
+    le_mm: Floats  # (2,)
+    te_mm: Floats  # (2,)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measurement:
+    """What is not there was not measured: `failures` names the step and says why.
+
+    `None` and an empty tuple differ: `damages` is None when nobody could look, empty when none was found.
+    `aligned_mm` (n, 3) is the cleaned scan in the nominal frame, `deviation_mm` (n,) its signed distance
+    to the nominal, positive outside. `detection_mm` is the depth of damage that is surely found in a
+    zone. `residual_mm` is what the twin leaves of the sound points: noise, without the form of the part.
+    `timing_s` counts the seconds of each step.
+    """
+
+    points: int  # as read, before cleaning
+    alignment: Alignment | None = None
+    aligned_mm: Floats = field(default_factory=lambda: NO_POINTS)
+    deviation_mm: Floats = field(default_factory=lambda: NO_VALUES)
+    sections: tuple[Section, ...] = ()
+    outlines: tuple[Outline, ...] = ()
+    twin_mesh: Mesh | None = None
+    form_mm: Measured = NO_TWIN
+    residual_mm: float | None = None
+    damages: tuple[Damage, ...] | None = None
+    detection_mm: Mapping[Zone, Measured] = field(default_factory=dict)
+    repairs: RepairVolume | None = None
+    zones: tuple[ZoneCoverage, ...] = ()
+    failures: Mapping[str, str] = field(default_factory=dict)
+    timing_s: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,281 @@
+"""plan.toml, one part number: what is required of a blade and where its limits lie."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
+
+from geometry.types import Zone
+from station.tomlfile import BadFile, Number, Positive, Settings, Text, read_settings
+
+SPAN_TOLERANCE_MM = 0.01  # a nominal in float32 does not end exactly where the plan says
+
+SectionKey = Literal[
+    "position_mm",
+    "orientation_deg",
+    "profile_mm",
+    "chord_mm",
+    "max_thickness_mm",
+    "le_radius_mm",
+    "te_radius_mm",
+]
+DamageZone = Literal["tip", "leading_edge", "trailing_edge", "surface"]
+
+
+class BadPlan(BadFile):
+    """A plan that contradicts itself, its nominal, or cannot be read."""
+
+
+class Limit(Settings):
+    """Up to `serviceable` the part flies as it is, up to `repairable` it can be repaired."""
+
+    serviceable: Number
+    repairable: Number
+
+    @model_validator(mode="after")
+    def ordered(self) -> Self:
+        if not 0.0 <= self.serviceable <= self.repairable:
+            raise ValueError("limits must be 0 <= serviceable <= repairable")
+        return self
+
+
+class CountLimit(Limit):
+    """How many damages, proven deeper than `min_depth_mm` (default: the detection limit)."""
+
+    min_depth_mm: Positive | None = None
+
+
+class Measurement(Settings):
+    sigma_mm: Positive
+    coverage_factor: Positive = 2.0
+
+
+class Airfoil(Settings):
+    z_min_mm: Number | None = None
+    z_max_mm: Number | None = None
+
+    @model_validator(mode="after")
+    def ordered(self) -> Self:
+        if self.z_min_mm is not None and self.z_max_mm is not None and self.z_max_mm <= self.z_min_mm:
+            raise ValueError("z_max_mm must lie above z_min_mm")
+        return self
+
+
+class Coverage(Settings):
+    min_fraction: Annotated[Number, Field(gt=0.0, le=1.0)] = 0.95
+    max_gap_mm: Positive = 1.5
+
+
+class Zones(Settings):
+    tip_mm: Positive = 5.0
+    edge_mm: Positive = 3.0
+
+
+class AlignmentChoice(Settings):
+    method: Literal["airfoil", "root", "six_point"] = "airfoil"
+    datum_z_mm: tuple[Number, Number] | None = None
+
+    @model_validator(mode="after")
+    def root_has_a_datum(self) -> Self:
+        if self.method == "root" and self.datum_z_mm is None:
+            raise ValueError('method = "root" needs datum_z_mm')
+        if self.datum_z_mm is not None and self.datum_z_mm[1] <= self.datum_z_mm[0]:
+            raise ValueError("datum_z_mm must be [lower, upper]")
+        return self
+
+
+class Algorithms(Settings):
+    registration: Literal["default", "thesis"] = "default"
+    sections: Literal["default", "thesis"] = "default"
+    twin: Literal["default", "thesis"] = "default"
+
+
+class Sections(Settings):
+    z_mm: tuple[Number, ...] = ()
+
+    @field_validator("z_mm")
+    @classmethod
+    def distinct(cls, z_mm: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(z_mm)) != len(z_mm):
+            raise ValueError("a section stands twice")
+        return z_mm
+
+
+class SectionKeys(Settings):
+    position_mm: Limit | None = None
+    orientation_deg: Limit | None = None
+    profile_mm: Limit | None = None
+    chord_mm: Limit | None = None
+    max_thickness_mm: Limit | None = None
+    le_radius_mm: Limit | None = None
+    te_radius_mm: Limit | None = None
+
+    def given(self) -> dict[str, Limit]:
+        """The limits that stand here, by characteristic."""
+        limits = ((key, getattr(self, key)) for key in type(self).model_fields)
+        return {key: limit for key, limit in limits if limit is not None}
+
+
+class SectionLimits(Settings):
+    """Limits of every section, and those of single sections, which win key by key."""
+
+    every: SectionKeys = SectionKeys()
+    single: Mapping[float, SectionKeys] = Field(default_factory=dict)
+
+    def at(self, z_mm: float) -> dict[str, Limit]:
+        """The limits of the section at `z_mm`, matched numerically."""
+        own = next((keys for z, keys in self.single.items() if same_z(z, z_mm)), None)
+        return self.every.given() | (own.given() if own else {})
+
+    def __bool__(self) -> bool:
+        return any(keys.given() for keys in (self.every, *self.single.values()))
+
+
+def same_z(a_mm: float, b_mm: float) -> bool:
+    """Whether two spellings of a height mean the same section."""
+    return math.isclose(a_mm, b_mm, rel_tol=0.0, abs_tol=1e-6)
+
+
+def every_and_single(table: object) -> object:
+    """`[limits.section]` with its `[limits.section."52.5"]` tables apart."""
+    if not isinstance(table, Mapping):
+        return table
+    single: dict[float, object] = {}
+    for key in (key for key in table if as_height(key) is not None):
+        z_mm = float(key)
+        if any(same_z(z_mm, other) for other in single):
+            raise ValueError(f'"{key}" stands twice')
+        single[z_mm] = table[key]
+    return {"every": {k: v for k, v in table.items() if as_height(k) is None}, "single": single}
+
+
+def as_height(key: str) -> float | None:
+    """The height that a table name spells, or None for the name of a characteristic."""
+    try:
+        z_mm = float(key)
+    except ValueError:
+        return None
+    return z_mm if math.isfinite(z_mm) else None
+
+
+class DamageLimits(Settings):
+    """Limits of one zone: largest depth, summed volume, number of damages."""
+
+    depth_mm: Limit | None = None
+    volume_mm3: Limit | None = None
+    count: CountLimit | None = None
+
+    def __bool__(self) -> bool:
+        return any((self.depth_mm, self.volume_mm3, self.count))
+
+
+class Form(Settings):
+    deviation_mm: Limit | None = None
+
+
+class Limits(Settings):
+    section: Annotated[SectionLimits, BeforeValidator(every_and_single)] = SectionLimits()
+    form: Form = Form()
+    damage: Mapping[DamageZone, DamageLimits] = Field(default_factory=dict)
+
+    def of_zone(self, zone: Zone) -> DamageLimits:
+        """The limits of a zone, none of them set when the plan does not name it."""
+        return next((limits for name, limits in self.damage.items() if name == zone), DamageLimits())
+
+    def __bool__(self) -> bool:
+        return bool(self.section or self.form.deviation_mm or any(self.damage.values()))
+
+
+class Repair(Settings):
+    allowance_mm: Annotated[Number, Field(ge=0.0)] = 0.0
+
+
+class Scan(Settings):
+    angles_deg: Annotated[tuple[Number, ...], Field(min_length=1, max_length=360)] = tuple(
+        float(angle) for angle in range(0, 360, 30)
+    )
+
+
+class BladePlan(Settings):
+    """One part number, as its file says it."""
+
+    schema_: Annotated[Literal["bladecell.plan/1"], Field(alias="schema")]
+    part_number: Text
+    revision: Text
+    nominal: Text
+    units: Literal["mm", "inch"] = "mm"
+    measurement: Measurement
+    airfoil: Airfoil = Airfoil()
+    coverage: Coverage = Coverage()
+    zones: Zones = Zones()
+    alignment: AlignmentChoice = AlignmentChoice()
+    algorithms: Algorithms = Algorithms()
+    sections: Sections = Sections()
+    limits: Limits
+    repair: Repair = Repair()
+    scan: Scan = Scan()
+    _path: Path = PrivateAttr(default=Path("plan.toml"))
+
+    def model_post_init(self, context: dict[str, Path] | None) -> None:
+        if context:
+            self._path = context["path"]
+
+    @property
+    def path(self) -> Path:
+        """The file that this plan was read from."""
+        return self._path
+
+    @property
+    def nominal_path(self) -> Path:
+        """Where the nominal lies."""
+        return (self._path.parent / self.nominal).resolve()
+
+    @model_validator(mode="after")
+    def consistent(self) -> Self:
+        if not self.limits:
+            raise ValueError("limits: the plan has no limit at all")
+        if self.limits.section and not self.sections.z_mm:
+            raise ValueError("limits.section: no section stands in [sections] z_mm")
+        for z_mm in self.limits.section.single:
+            if not any(same_z(z_mm, other) for other in self.sections.z_mm):
+                raise ValueError(f'limits.section."{z_mm:g}": no such section in [sections] z_mm')
+        return self
+
+
+def read_plan(path: Path) -> BladePlan:
+    """The plan that `path` holds; raises `BadPlan`. Its nominal is not opened."""
+    plan = read_settings(path, BladePlan, BadPlan)
+    check_nominal_path(plan)
+    return plan
+
+
+def check_nominal_path(plan: BladePlan) -> None:
+    """Raise `BadPlan` unless the nominal is a file inside the folder tree of its plan."""
+    if not plan.nominal_path.is_relative_to(plan.path.parent.resolve()):
+        raise BadPlan(plan.path, f"{plan.nominal!r} lies outside the folder of the plan", "nominal")
+    if not plan.nominal_path.is_file():
+        raise BadPlan(plan.path, f"there is no file {plan.nominal!r}", "nominal")
+
+
+def check_span(plan: BladePlan, z_low_mm: float, z_high_mm: float) -> None:
+    """Raise `BadPlan` unless airfoil, datum and sections lie on a nominal that spans these heights."""
+    for where, z_mm in heights(plan):
+        if not z_low_mm - SPAN_TOLERANCE_MM <= z_mm <= z_high_mm + SPAN_TOLERANCE_MM:
+            raise BadPlan(plan.path, off_span(z_mm, z_low_mm, z_high_mm), where)
+    for z_mm in plan.sections.z_mm:
+        if not z_low_mm < z_mm < z_high_mm:
+            raise BadPlan(plan.path, off_span(z_mm, z_low_mm, z_high_mm), "sections.z_mm")
+
+
+def heights(plan: BladePlan) -> list[tuple[str, float]]:
+    """The heights that may lie on an end of the nominal, with the key that each stands under."""
+    named = [("airfoil.z_min_mm", plan.airfoil.z_min_mm), ("airfoil.z_max_mm", plan.airfoil.z_max_mm)]
+    datum_mm = plan.alignment.datum_z_mm if plan.alignment.method == "root" else None
+    datum = [("alignment.datum_z_mm", z_mm) for z_mm in datum_mm or ()]
+    return [(where, z_mm) for where, z_mm in named if z_mm is not None] + datum
+
+
+def off_span(z_mm: float, z_low_mm: float, z_high_mm: float) -> str:
+    return f"{z_mm:g} mm is outside the nominal's span, {z_low_mm:g} to {z_high_mm:g} mm"

@@ -1,0 +1,110 @@
+"""A plan made ready to measure by: its nominal prepared once, its settings in the geometry's terms."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.airfoil import SectionSettings
+from geometry.calibrate import AxisCalibration
+from geometry.coverage import CoverageSettings
+from geometry.errors import BadInput
+from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
+from geometry.repair import RepairSettings
+from station.config import Calibration
+from station.measurement import Outline
+from station.plans import BadPlan, BladePlan, check_span
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Recipe:
+    """What is measured and how. `axis` is None where clouds come merged."""
+
+    plan: BladePlan
+    nominal: Nominal
+    outlines: tuple[Outline, ...]
+    axis: AxisCalibration | None
+    nominal_sha256: str
+    plan_sha256: str
+
+    @property
+    def section_settings(self) -> SectionSettings:
+        return SectionSettings(max_gap_mm=self.plan.coverage.max_gap_mm)
+
+    @property
+    def repair_settings(self) -> RepairSettings:
+        return RepairSettings(max_gap_mm=self.plan.coverage.max_gap_mm)
+
+    @property
+    def coverage_settings(self) -> CoverageSettings:
+        wanted = self.plan.coverage
+        return CoverageSettings(min_fraction=wanted.min_fraction, max_gap_mm=wanted.max_gap_mm)
+
+
+def prepare_recipe(plan: BladePlan, axis: AxisCalibration | None = None) -> Recipe:
+    """The recipe of a plan; raises `BadPlan` where the plan contradicts its nominal or what can be done."""
+    check_choices(plan)
+    plan_sha256, nominal_sha256 = (
+        hashlib.sha256(path.read_bytes()).hexdigest() for path in (plan.path, plan.nominal_path)
+    )
+    try:
+        mesh = read_nominal(plan.nominal_path, plan.units)
+        check_span(plan, float(mesh.vertices_mm[:, 2].min()), float(mesh.vertices_mm[:, 2].max()))
+        nominal = prepare_nominal(mesh, nominal_settings(plan))
+        outlines = tuple(outline(nominal, z_mm) for z_mm in plan.sections.z_mm)
+    except BadInput as error:
+        raise BadPlan(plan.path, str(error), "nominal") from error
+    return Recipe(
+        plan=plan,
+        nominal=nominal,
+        outlines=outlines,
+        axis=axis,
+        nominal_sha256=nominal_sha256,
+        plan_sha256=plan_sha256,
+    )
+
+
+def outline(nominal: Nominal, z_mm: float) -> Outline:
+    """The nominal curve of a section with its two edges."""
+    section = nominal.section(z_mm)
+    return Outline(
+        z_mm=z_mm,
+        curve_mm=section.curve_mm,
+        le_mm=section.curve_mm[section.le_index],
+        te_mm=section.curve_mm[section.te_index],
+    )
+
+
+def nominal_settings(plan: BladePlan) -> NominalSettings:
+    return NominalSettings(
+        z_min_mm=plan.airfoil.z_min_mm,
+        z_max_mm=plan.airfoil.z_max_mm,
+        tip_mm=plan.zones.tip_mm,
+        edge_mm=plan.zones.edge_mm,
+    )
+
+
+def check_choices(plan: BladePlan) -> None:
+    """Raise `BadPlan` for a choice that a plan may name and this version does not offer."""
+    offered = {
+        "alignment.method": (plan.alignment.method, "airfoil"),
+        "algorithms.registration": (plan.algorithms.registration, "default"),
+        "algorithms.sections": (plan.algorithms.sections, "default"),
+        "algorithms.twin": (plan.algorithms.twin, "default"),
+    }
+    for where, (wanted, ours) in offered.items():
+        if wanted != ours:
+            raise BadPlan(plan.path, f'"{wanted}" is not offered by this version, only "{ours}"', where)
+    if plan.repair.allowance_mm > 0.0:
+        raise BadPlan(plan.path, "an allowance is not offered by this version", "repair.allowance_mm")
+
+
+def axis_of(calibration: Calibration) -> AxisCalibration:
+    """The calibration file in the geometry's terms; raises `BadInput` for a matrix that is no motion."""
+    return AxisCalibration(
+        T_scanner_table0=np.array(calibration.T_scanner_table0),
+        sigma_offset_mm=calibration.sigma_axis_offset_mm,
+        sigma_tilt_deg=calibration.sigma_axis_tilt_deg,
+    )
