@@ -9,11 +9,14 @@ from scipy.spatial import cKDTree
 from geometry.nominal import ZONE_ORDER, Nominal
 from geometry.regions import Field, Region, RegionSettings, find_regions, on_twin, stand_off
 from geometry.register import Alignment
+from geometry.solid import slice_loops
 from geometry.span import on_line_mm
 from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone
 
 PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
+FOREMOST = 5  # points whose middle one is the metal left of a slab: one alone is noise
+NEAR_EDGE_MM = 6.0  # of the edge line, where the edge of the twin is sought
 PRECEDENCE = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
 
 
@@ -144,7 +147,7 @@ def _described(
     if kind is DamageKind.EXCESS or zone in (Zone.SURFACE, Zone.OUTSIDE):
         depth = _normal_depth(region, found)
     elif zone is Zone.TIP:
-        depth = _span_depth(region, found, nominal, twin)
+        depth = _span_depth(region, found, nominal, twin, settings)
     else:
         depth = _edge_depth(region, found, nominal, twin, zone, settings.slab_mm)
     return Damage(
@@ -208,17 +211,24 @@ def _normal_depth(region: Region, found: Field) -> Measurand:
     return Measurand(name="depth", value=value_mm, sigma=sigma_mm, unit="mm")
 
 
-def _span_depth(region: Region, found: Field, nominal: Nominal, twin: Twin) -> Measured:
-    """The loss along the span: from the twin's tip down to the lowest point of the broken surface."""
+def _span_depth(
+    region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings
+) -> Measured:
+    """The loss along the span: from the twin's tip down to the lowest point of the broken surface.
+
+    Where the break runs out into the skin, the last of it stands off by less than a region's threshold; a
+    break at 45 degrees hides about that much of its height.
+    """
     tip_face = nominal.samples.tip_face
     if not tip_face.any():
         return NotMeasured(reason="the span ends short of the tip")
     tip_mm = float(on_twin(nominal, twin)[tip_face, 2].mean())
     lowest = np.sort(found.scan_mm[region.points, 2])[: max(3, len(region.points) // 2000)]
-    sigma_mm = np.hypot(_median_sigma_mm(region, found), found.spacing_mm / np.sqrt(12.0))
+    hidden_mm = settings.regions.low * _median_sigma_mm(region, found)
+    sigma_mm = np.hypot(hidden_mm, found.spacing_mm / np.sqrt(12.0))
     return Measurand(
         name="depth",
-        value=max(tip_mm - float(lowest.mean()), 0.0),
+        value=max(tip_mm - float(lowest.mean()) + hidden_mm, 0.0),
         sigma=float(np.hypot(sigma_mm, np.std(lowest))),
         unit="mm",
     )
@@ -232,37 +242,38 @@ def _edge_depth(
     region: Region, found: Field, nominal: Nominal, twin: Twin, zone: Zone, slab_mm: float
 ) -> Measured:
     """The largest loss in a section plane, along the chord: from the twin's edge to the metal left."""
-    points_mm = found.scan_mm[region.points]
-    heights_mm = np.arange(points_mm[:, 2].min(), points_mm[:, 2].max() + slab_mm, 0.5 * slab_mm)
-    losses = [_slab_loss(points_mm, z_mm, nominal, twin, zone, slab_mm) for z_mm in heights_mm]
-    measured = [loss for loss in losses if loss is not None]
-    if not measured:
+    z_mm = found.scan_mm[region.points, 2]
+    near_mm = _around(found.scan_mm, region.points, slab_mm)
+    flat = np.zeros((len(twin.mesh.faces), 3, 3))
+    heights_mm = np.arange(z_mm.min() + 0.5 * slab_mm, z_mm.max(), 0.5 * slab_mm)
+    losses = []
+    for height_mm in heights_mm if len(heights_mm) else [float(z_mm.mean())]:
+        outward, edge_mm = _outward(nominal, zone, float(height_mm))
+        slab = near_mm[np.abs(near_mm[:, 2] - height_mm) <= 0.5 * slab_mm, :2] @ outward
+        loops = slice_loops(twin.mesh, flat, float(height_mm))
+        rim = np.concatenate([loop.points_mm for loop in loops]) if loops else np.zeros((0, 2))
+        rim = rim[np.linalg.norm(rim - edge_mm, axis=1) < NEAR_EDGE_MM]
+        if len(slab) >= FOREMOST and len(rim):
+            losses.append(float((rim @ outward).max() - np.median(np.sort(slab)[-FOREMOST:])))
+    if not losses:
         return NotMeasured(reason="no section through the damage has enough points on it")
-    value_mm, scatter_mm = max(measured)
     sigma_mm = np.hypot(_median_sigma_mm(region, found), found.spacing_mm / np.sqrt(12.0))
-    return Measurand(name="depth", value=value_mm, sigma=float(np.hypot(sigma_mm, scatter_mm)), unit="mm")
+    return Measurand(name="depth", value=max(*losses, 0.0), sigma=float(sigma_mm), unit="mm")
 
 
-def _slab_loss(
-    points_mm: Floats, z_mm: float, nominal: Nominal, twin: Twin, zone: Zone, slab_mm: float
-) -> tuple[float, float] | None:
-    """The loss of one slab and its standard error, or None with too few points on the break."""
-    near_mm = points_mm[np.abs(points_mm[:, 2] - z_mm) <= 0.5 * slab_mm]
-    if len(near_mm) < 5:
-        return None
-    own, other = (nominal.le_line_mm, nominal.te_line_mm)
-    if zone is Zone.TRAILING_EDGE:
-        own, other = other, own
-    edge_mm, far_mm = (on_line_mm(line, np.array([z_mm]))[0] for line in (own, other))
-    outward = (edge_mm - far_mm) / np.linalg.norm(edge_mm - far_mm)
-    edge_3d_mm = np.append(edge_mm, z_mm)
-    nominal_mm = twin.mesh.vertices_mm - twin.displacement_mm
-    vertex = int(np.argmin(((nominal_mm - edge_3d_mm) ** 2).sum(axis=1)))
-    tip_of_edge_mm = edge_mm + twin.displacement_mm[vertex, :2]
-    remaining_mm = near_mm[:, :2] @ outward
-    outer = remaining_mm[remaining_mm >= np.median(remaining_mm)]
-    loss_mm = float(tip_of_edge_mm @ outward - np.median(outer))
-    return (loss_mm, float(np.std(outer) / np.sqrt(len(outer)))) if loss_mm > 0.0 else None
+def _around(scan_mm: Floats, points: Ints, margin_mm: float) -> Floats:
+    """The scan points in the box of some of them."""
+    low_mm, high_mm = scan_mm[points].min(axis=0) - margin_mm, scan_mm[points].max(axis=0) + margin_mm
+    return np.asarray(scan_mm[((scan_mm >= low_mm) & (scan_mm <= high_mm)).all(axis=1)])
+
+
+def _outward(nominal: Nominal, zone: Zone, z_mm: float) -> tuple[Floats, Floats]:
+    """The direction (2,) along the chord out of an edge at a height, and the edge (2,) there."""
+    le_mm, te_mm = (
+        on_line_mm(line, np.array([z_mm]))[0] for line in (nominal.le_line_mm, nominal.te_line_mm)
+    )
+    chord_mm = le_mm - te_mm if zone is Zone.LEADING_EDGE else te_mm - le_mm
+    return chord_mm / np.linalg.norm(chord_mm), le_mm if zone is Zone.LEADING_EDGE else te_mm
 
 
 def _area(region: Region, found: Field, nominal: Nominal) -> Measurand:
