@@ -2,12 +2,13 @@
 
 Modbus tells the sensor's state and the stamp of its last frame, the control channel starts and triggers,
 the data channel brings groups. A capture counts only if its index is exactly one more than before the
-trigger, its time later, its serial the configured one, its group whole, and if Modbus then agrees.
+trigger, its time not before the trigger, its serial the configured one, its group whole, and if Modbus
+then agrees.
 """
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from types import TracebackType
@@ -23,20 +24,21 @@ from drivers.wire.scanner import (
     SENSOR_STATE,
     STAMP_BLOCK,
     STAMP_BLOCK_COUNT,
+    STATE_BLOCK_COUNT,
     Control,
     FrameSplitter,
     GroupSplitter,
     RangeFrame,
-    StampBlock,
     Status,
     decode_control_reply,
     decode_group,
     decode_stamp_block,
+    decode_state_block,
     encode_control,
 )
 
 Splitter = FrameSplitter | GroupSplitter
-Opened = TypeVar("Opened")
+Answer = TypeVar("Answer")
 
 _UNIT = 1
 _CONNECT_S = 5.0
@@ -50,9 +52,10 @@ _MOST_WAITING = 4  # groups nobody asked for: the oldest go
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScannerStatus:
-    """What Modbus says: whether the sensor runs, and the stamp of its last frame."""
+    """What Modbus says: whether the sensor runs, its clock, and the stamp of its last frame."""
 
     running: bool
+    time_us: int
     frame_index: int
     timestamp_us: int
 
@@ -162,10 +165,13 @@ class Scanner:
 
     async def status(self) -> ScannerStatus:
         """State and last stamp, by Modbus."""
-        (state,) = await self._read(SENSOR_STATE, 1)
-        block = await self._stamp_block()
+        state = decode_state_block(await self._read(SENSOR_STATE, STATE_BLOCK_COUNT))
+        stamp = decode_stamp_block(await self._read(STAMP_BLOCK, STAMP_BLOCK_COUNT))
         return ScannerStatus(
-            running=state == 1, frame_index=block.frame_index, timestamp_us=block.timestamp_us
+            running=state.running,
+            time_us=state.time_us,
+            frame_index=stamp.frame_index,
+            timestamp_us=stamp.timestamp_us,
         )
 
     async def capture(self) -> RangeFrame:
@@ -189,15 +195,19 @@ class Scanner:
             return frame
 
     async def _trigger(self, before: ScannerStatus) -> RangeFrame:
-        """The next frame after `before`."""
+        """The frame of a trigger sent now. Frames that are older by index or by time are passed over."""
         await self._command(Control.TRIGGER)
         clock = asyncio.get_running_loop().time
         deadline = clock() + self._capture_timeout_s
+        last = before.frame_index
         while True:
             raw = await self._data.receive(max(deadline - clock(), 0.0), "frame")
             frame = await asyncio.to_thread(self._decode, raw)
             if frame.frame_index > before.frame_index:
-                return self._checked(frame, before)
+                self._check(frame, last)
+                if frame.timestamp_us >= before.time_us and frame.timestamp_us > before.timestamp_us:
+                    return frame
+                last = frame.frame_index
 
     def _decode(self, raw: bytes) -> RangeFrame:
         try:
@@ -205,23 +215,13 @@ class Scanner:
         except BadReply as error:
             raise error.at(self._data.port) from None
 
-    def _checked(self, frame: RangeFrame, before: ScannerStatus) -> RangeFrame:
-        """The frame, if it is the one next after `before` and of this scanner."""
-        wrong = {
-            f"frame {frame.frame_index}, want {before.frame_index + 1}": (
-                frame.frame_index != before.frame_index + 1
-            ),
-            f"frame at {frame.timestamp_us} us, not after {before.timestamp_us}": (
-                frame.timestamp_us <= before.timestamp_us
-            ),
-            f"frame of scanner {frame.scanner_serial}, want {self.serial}": (
-                frame.scanner_serial != self.serial
-            ),
-        }
-        for what, found in wrong.items():
-            if found:
-                raise BadReply("scanner", self._data.port, what)
-        return frame
+    def _check(self, frame: RangeFrame, last: int) -> None:
+        """Raise `BadReply` unless the frame is of this scanner and the next after frame `last`."""
+        if frame.scanner_serial != self.serial:
+            what = f"frame of scanner {frame.scanner_serial}, want {self.serial}"
+            raise BadReply("scanner", self._data.port, what)
+        if frame.frame_index != last + 1:
+            raise BadReply("scanner", self._data.port, f"frame {frame.frame_index}, want {last + 1}")
 
     async def _command(self, command: Control) -> bytes:
         """The payload of an accepted command; silence closes the channel, for replies carry no id."""
@@ -252,9 +252,6 @@ class Scanner:
                 raise BadReply("scanner", self.host, f"no {what} within {_AGREE_S:g} s")
             await asyncio.sleep(_POLL_S)
 
-    async def _stamp_block(self) -> StampBlock:
-        return decode_stamp_block(await self._read(STAMP_BLOCK, STAMP_BLOCK_COUNT))
-
     async def _read(self, address: int, count: int) -> list[int]:
         """Holding registers; after silence or a contradiction once more, on a new connection."""
         try:
@@ -273,10 +270,12 @@ class Scanner:
         pymodbus lets through an answer with transaction 0, another function code or another count.
         """
         port, what = f"{self.host}:{self._ports[0]}", f"registers {address}+{count}"
-        if not (self._modbus.connected or await self._modbus.connect()):
+        if not (self._modbus.connected or await _heeding(self._modbus.connect())):
             raise LinkDown("scanner", port, f"{what}: not connected")
         try:
-            answer = await self._modbus.read_holding_registers(address, count=count, device_id=_UNIT)
+            answer = await _heeding(
+                self._modbus.read_holding_registers(address, count=count, device_id=_UNIT)
+            )
         except ConnectionException as error:
             raise LinkDown("scanner", port, f"{what}: not connected") from error
         except ModbusException as error:
@@ -293,7 +292,7 @@ class Scanner:
         client = AsyncModbusTcpClient(self.host, port=port, timeout=_MODBUS_S, retries=0, reconnect_delay=0)
         clock = asyncio.get_running_loop().time
         deadline = clock() + _CONNECT_S
-        while not await client.connect():
+        while not await _heeding(client.connect()):
             if clock() > deadline:
                 client.close()
                 raise LinkDown("scanner", f"{self.host}:{port}", "no Modbus connection")
@@ -310,3 +309,18 @@ class Scanner:
         except (OSError, TimeoutError) as error:
             raise LinkDown("scanner", where, f"no connection: {error}") from error
         return channel
+
+
+async def _heeding(call: Awaitable[Answer]) -> Answer:
+    """The result of a pymodbus call; raises the cancellation that came together with it.
+
+    pymodbus waits with `asyncio.wait_for`, which in Python 3.11 drops a cancellation that meets the answer.
+    """
+    task = asyncio.current_task()
+    assert task is not None
+    cancellations = task.cancelling()
+    try:
+        return await call
+    finally:
+        if task.cancelling() > cancellations:
+            raise asyncio.CancelledError

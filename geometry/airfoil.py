@@ -15,15 +15,17 @@ from geometry.chart import SectionSettings, unroll
 from geometry.curve import (
     Edge,
     Estimate,
-    Thick,
+    Pair,
+    camber_line,
     centroid,
     centroid_gradient,
     chord,
     edge,
     edge_radius,
-    max_thickness,
+    gauge,
     orientation,
     thick_part,
+    thickness,
 )
 from geometry.errors import CannotMeasure
 from geometry.nominal import Nominal
@@ -41,6 +43,9 @@ __all__ = [
     "with_damages",
 ]
 
+_SIDES = ("le", "ss", "te", "ps")  # as `NominalSection.side` numbers them: edges, suction, pressure side
+_GAUGE = 0.05  # of the chord: this far inside either edge its thickness is taken
+
 SECTION_MEASURANDS: Mapping[str, Unit] = {
     "position_x_mm": "mm",
     "position_y_mm": "mm",
@@ -53,6 +58,9 @@ SECTION_MEASURANDS: Mapping[str, Unit] = {
     "le_radius_mm": "mm",
     "te_radius_mm": "mm",
     "stagger_deg": "deg",
+    "le_thickness_mm": "mm",
+    "te_thickness_mm": "mm",
+    **{f"{side}_profile_{end}_mm": "mm" for side in _SIDES for end in ("max", "min")},
 }
 
 
@@ -87,25 +95,25 @@ class Section:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Definition:
-    """What the nominal section fixes for its measured twin: arcs, and the nominal values."""
+    """What the nominal section fixes for the measured one: which metal is an edge, a side, the thick part."""
 
-    curve_mm: Floats
+    curve_mm: Floats  # (m, 2) corresponding nodes: trailing edge at 0, leading edge at m / 2
+    side: Ints  # (m,) index into _SIDES
     le: Edge
     te: Edge
-    thick: Thick
+    thick: Mapping[str, Pair]  # where each thickness is taken
 
     def supports(self) -> Mapping[str, Bools]:
         """Nodes (m,) that each measurand needs."""
         m = len(self.curve_mm)
-        edges = _mark(m, self.le.zone) | _mark(m, self.te.zone)
-        needed = {
-            "chord_mm": edges,
-            "stagger_deg": edges,
-            "max_thickness_mm": _mark(m, self.thick.first) | _mark(m, self.thick.second),
-            "le_radius_mm": _mark(m, self.le.arc),
-            "te_radius_mm": _mark(m, self.te.arc),
-        }
-        return {name: needed.get(name, np.ones(m, bool)) for name in SECTION_MEASURANDS}
+        needed = dict.fromkeys(SECTION_MEASURANDS, np.ones(m, bool))
+        needed["chord_mm"] = needed["stagger_deg"] = _mark(m, self.le.zone) | _mark(m, self.te.zone)
+        needed["le_radius_mm"], needed["te_radius_mm"] = _mark(m, self.le.arc), _mark(m, self.te.arc)
+        for name, pair in self.thick.items():
+            needed[name] = _mark(m, pair.node) | _mark(m, pair.across)
+        for index, side in enumerate(_SIDES):
+            needed[f"{side}_profile_max_mm"] = needed[f"{side}_profile_min_mm"] = self.side == index
+        return needed
 
 
 def _mark(m: int, nodes: Ints) -> Bools:
@@ -114,23 +122,34 @@ def _mark(m: int, nodes: Ints) -> Bools:
     return marked
 
 
-def define(nominal_mm: Floats) -> Definition:
-    """The definition from a nominal curve of corresponding nodes: trailing edge at 0, leading at m / 2."""
-    le = len(nominal_mm) // 2
+def define(nominal_mm: Floats, side: Ints) -> Definition:
+    """The definition from a nominal curve of corresponding nodes and the side that each is on."""
+    nose = len(nominal_mm) // 2
+    le, te = edge(nominal_mm, nose), edge(nominal_mm, 0)
+    camber = camber_line(nominal_mm, nose)
+    line = chord(nominal_mm, le, te)
+    length = line.length.value
+    along = (line.tail_mm - line.nose_mm) / length
     return Definition(
-        curve_mm=nominal_mm, le=edge(nominal_mm, le), te=edge(nominal_mm, 0), thick=thick_part(nominal_mm, le)
+        curve_mm=nominal_mm,
+        side=side,
+        le=le,
+        te=te,
+        thick={
+            "max_thickness_mm": thick_part(camber),
+            "le_thickness_mm": gauge(camber, line.nose_mm, along, _GAUGE * length),
+            "te_thickness_mm": gauge(camber, line.tail_mm, -along, _GAUGE * length),
+        },
     )
 
 
-def shape(curve_mm: Floats, define: Definition) -> dict[str, Estimate]:
+def shape(curve_mm: Floats, definition: Definition) -> dict[str, Estimate]:
     """The estimates that need one curve only, by name; the same for a nominal and a measured section."""
-    line = chord(curve_mm, define.le, define.te)
-    found = {
-        "chord_mm": line.length,
-        "stagger_deg": _degrees(line.stagger),
-        "max_thickness_mm": max_thickness(curve_mm, define.thick),
-    }
-    for name, end in (("le_radius_mm", define.le), ("te_radius_mm", define.te)):
+    line = chord(curve_mm, definition.le, definition.te)
+    found = {"chord_mm": line.length, "stagger_deg": _degrees(line.stagger)}
+    for name, pair in definition.thick.items():
+        found[name] = thickness(curve_mm, pair)
+    for name, end in (("le_radius_mm", definition.le), ("te_radius_mm", definition.te)):
         try:
             found[name] = edge_radius(curve_mm, end.arc)
         except CannotMeasure:
@@ -156,15 +175,25 @@ def _degrees(angle: Estimate) -> Estimate:
     return Estimate(value=float(np.rad2deg(angle.value)), gradient=np.rad2deg(angle.gradient))
 
 
-def extremes(deviation_mm: Floats, seen: Bools) -> dict[str, Estimate]:
-    """Largest and smallest signed distance to the nominal section over the nodes that were seen."""
+def extremes(deviation_mm: Floats, seen: Bools, side: Ints) -> dict[str, Estimate]:
+    """Largest and smallest signed distance to the nominal over the seen nodes: of all, and of each side."""
+    parts = {"": seen, **{f"{name}_": seen & (side == index) for index, name in enumerate(_SIDES)}}
     found = {}
-    for name, sign in (("profile_max_mm", 1.0), ("profile_min_mm", -1.0)):
-        node = int(np.argmax(np.where(seen, sign * deviation_mm, -np.inf)))
-        gradient = np.zeros(len(deviation_mm))
-        gradient[node] = 1.0
-        found[name] = Estimate(value=float(deviation_mm[node]), gradient=gradient)
+    for name, part in parts.items():
+        if part.any():
+            found[f"{name}profile_max_mm"] = _at(
+                deviation_mm, int(np.argmax(np.where(part, deviation_mm, -np.inf)))
+            )
+            found[f"{name}profile_min_mm"] = _at(
+                deviation_mm, int(np.argmin(np.where(part, deviation_mm, np.inf)))
+            )
     return found
+
+
+def _at(deviation_mm: Floats, node: int) -> Estimate:
+    gradient = np.zeros(len(deviation_mm))
+    gradient[node] = 1.0
+    return Estimate(value=float(deviation_mm[node]), gradient=gradient)
 
 
 def measure_sections(
@@ -191,7 +220,7 @@ def _measure(
 ) -> Section:
     """One section."""
     chart = unroll(nominal, z_mm, settings.band_mm, settings)
-    definition = define(chart.curve_mm)
+    definition = define(chart.curve_mm, chart.side)
     try:
         profile = reconstruct(scan, chart, settings)
     except CannotMeasure as why:
@@ -209,7 +238,7 @@ def _section(profile: Profile, definition: Definition, alignment: Alignment) -> 
     estimates = {
         **place(profile.curve_mm, definition.curve_mm),
         **shape(profile.curve_mm, definition),
-        **extremes(profile.deviation_mm, seen),
+        **extremes(profile.deviation_mm, seen, definition.side),
     }
     sigmas = _sigmas(profile, estimates, alignment)
     measurands = _judge_supports(profile, definition, estimates, sigmas)
@@ -302,8 +331,7 @@ def _runs(seen: Bools) -> tuple[Ints, Ints]:
 def _nominals(definition: Definition) -> Mapping[str, float]:
     """The nominal value of every measurand that the nominal has."""
     found = shape(definition.curve_mm, definition)
-    kinds = ("position", "orientation", "profile")
-    against = (name for name in SECTION_MEASURANDS if name.startswith(kinds))
+    against = (n for n in SECTION_MEASURANDS if "profile" in n or n.startswith(("position", "orientation")))
     return {**dict.fromkeys(against, 0.0), **{name: e.value for name, e in found.items()}}
 
 

@@ -36,9 +36,9 @@ class Skin:
         self._cells = (max(int(x), 1), max(int(y), 1), max(int(z), 1))
         self._start, self._member = triangle_cells(self.triangles_mm, self.low_mm, self._cell_mm, self._cells)
 
-    def closest(self, points_mm: Floats) -> tuple[Floats, Ints]:
-        """Signed distance (n,) and nearest face (n,) of every point (n, 3)."""
-        distance_mm, _, face = closest_on_triangles(
+    def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
+        """Signed distance (n,), closest point (n, 3) and its face (n,) for every point (n, 3)."""
+        return closest_on_triangles(
             np.ascontiguousarray(points_mm),
             self.triangles_mm,
             self.normals,
@@ -48,7 +48,6 @@ class Skin:
             self._cell_mm,
             self._cells,
         )
-        return distance_mm, face
 
     def samples(self, pitch_mm: float, low_mm: Floats, high_mm: Floats) -> tuple[Floats, Floats]:
         """Points (n, 3) spread evenly over the faces in a box, pitch squared each, and their normals."""
@@ -73,6 +72,16 @@ class Scan:
     points_mm: Floats  # (n, 3)
     sigma_mm: Floats  # (n,)
     flagged: Bools  # (n,) in any damage
+    twin_sigma_mm: float  # of the twin's skin where sound points support it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rim:
+    """Scan points on the sound skin near the break, evened out."""
+
+    points_mm: Floats  # (r, 3) as scanned
+    feet_mm: Floats  # (r, 3) on the twin
+    normals: Floats  # (r, 3) of the twin there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,7 +90,7 @@ class BrokenSurface:
 
     raw_mm: Floats  # (k, 3) the scan points on it
     sigma_mm: float  # of those points, along the normal
-    sound_mm: Floats  # (s, 3) scan points on the skin around it
+    rim: Rim
     points_mm: Floats  # (n, 3) evened out and denoised
     frames: Floats  # (n, 3, 3) rows: two tangents, outward normal (away from metal)
     bending: Floats  # (n, 3) second derivatives uu, uv, vv
@@ -96,9 +105,9 @@ class BrokenSurface:
 
     @property
     def facing(self) -> Floats:
-        """Unit vector of the summed area: the way out."""
-        total = (self.frames[:, 2] * self.spacing_mm[:, None] ** 2).sum(axis=0)
-        return np.asarray(total / np.linalg.norm(total))
+        """The way out: mean outward normal (3,), as long as the surface is flat (1) or wraps around (0)."""
+        weight = self.spacing_mm**2 / self.area_mm2
+        return np.asarray((self.frames[:, 2] * weight[:, None]).sum(axis=0))
 
 
 def find_broken_surface(
@@ -106,20 +115,20 @@ def find_broken_surface(
 ) -> BrokenSurface:
     """The broken surface under the points `flagged` as one damage.
 
-    A point on it lies deeper below the twin than `film_sigmas` of its own noise, in company. Raises
-    `CannotRepair` if there are fewer than `min_points`, or if inside cannot be told from outside.
+    Points on it lie provably below the twin. Raises `CannotRepair` if there are fewer than `min_points`,
+    or if inside cannot be told from outside.
     """
     pitch_mm = _spacing(scan.points_mm[flagged])
     near = _points_near(scan, flagged, 3.0 * pitch_mm)
-    depth_mm = -skin.closest(scan.points_mm[near])[0]
-    deep = _in_company(scan.points_mm[near], depth_mm > film_sigmas * scan.sigma_mm[near])
+    deep = _deep(skin, scan, near, film_sigmas)
     if deep.sum() < min_points:
         raise CannotRepair(f"{deep.sum()} scan points lie provably below the twin, {min_points} are needed")
     raw_mm, sigma_mm = scan.points_mm[near[deep]], float(np.median(scan.sigma_mm[near[deep]]))
     sound_mm = _sound_points(scan, near[~deep], raw_mm)
-    points_mm, frames, bending = _local_quadrics(_thinned(raw_mm, 6.0 * sigma_mm), raw_mm)
+    points_mm, frames, bending = _local_quadrics(_thinned(raw_mm, 6.0 * sigma_mm))
+    spacing_mm = _spacings(points_mm)
+    lost_pitch_mm = float(np.clip(np.sqrt((spacing_mm**2).sum()) / 15.0, 0.1, 1.0))
     support_mm = min(SUPPORT * pitch_mm, 0.5 * max_gap_mm)
-    lost_pitch_mm = float(np.clip(np.ptp(raw_mm, axis=0).max() / 25.0, 0.1, 1.0))
     lost_mm, lost_normals = _lost_skin(skin, raw_mm, sound_mm, lost_pitch_mm, support_mm)
     inward = _outward_sign(points_mm, frames[:, 2], _towards(points_mm, lost_mm, lost_normals)) < 0.0
     frames[inward, 1:] *= -1.0
@@ -127,15 +136,39 @@ def find_broken_surface(
     return BrokenSurface(
         raw_mm=raw_mm,
         sigma_mm=sigma_mm,
-        sound_mm=sound_mm,
+        rim=_rim(skin, raw_mm, sound_mm, max_gap_mm, 6.0 * sigma_mm),
         points_mm=points_mm,
         frames=frames,
         bending=bending,
-        spacing_mm=_spacings(points_mm),
+        spacing_mm=spacing_mm,
         lost_mm=lost_mm,
-        lost_reach_mm=support_mm + lost_pitch_mm,
-        film_mm=film_sigmas * sigma_mm,
+        lost_reach_mm=1.5 * lost_pitch_mm + pitch_mm,
+        film_mm=film_sigmas * float(np.hypot(sigma_mm, scan.twin_sigma_mm)),
     )
+
+
+def _rim(skin: Skin, raw_mm: Floats, sound_mm: Floats, width_mm: float, cell_mm: float) -> Rim:
+    """The sound points within `width_mm` of the break."""
+    points_mm = sound_mm[_within(sound_mm, raw_mm, width_mm)]
+    if len(points_mm):
+        points_mm = _thinned(points_mm, cell_mm)
+    _, feet_mm, face = skin.closest(points_mm)
+    return Rim(points_mm=points_mm, feet_mm=feet_mm, normals=skin.normals[face])
+
+
+def _within(points_mm: Floats, others_mm: Floats, reach_mm: float) -> Ints:
+    """Indices of the points that have one of the others within reach."""
+    low, high = others_mm.min(axis=0) - reach_mm, others_mm.max(axis=0) + reach_mm
+    boxed = np.flatnonzero(((points_mm >= low) & (points_mm <= high)).all(axis=1))
+    distance_mm, _ = cKDTree(others_mm).query(points_mm[boxed], distance_upper_bound=reach_mm)
+    return boxed[np.isfinite(distance_mm)]
+
+
+def frames_along(normals: Floats) -> Floats:
+    """Right-handed frames (n, 3, 3) whose rows are two tangents and the normal."""
+    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first), normals], axis=1)
 
 
 def _spacings(points_mm: Floats) -> Floats:
@@ -152,19 +185,20 @@ def _spacing(points_mm: Floats) -> float:
 
 
 def _points_near(scan: Scan, flagged: Ints, reach_mm: float) -> Ints:
-    """Indices of the flagged points and of those within reach of one."""
-    low, high = scan.points_mm[flagged].min(axis=0) - reach_mm, scan.points_mm[flagged].max(axis=0) + reach_mm
-    boxed = np.flatnonzero(((scan.points_mm >= low) & (scan.points_mm <= high)).all(axis=1))
-    distance_mm, _ = cKDTree(scan.points_mm[flagged]).query(
-        scan.points_mm[boxed], distance_upper_bound=reach_mm
-    )
-    return boxed[np.isfinite(distance_mm)]
+    """Indices of the flagged points, and of those within reach of one that no damage claims."""
+    free = _within(scan.points_mm, scan.points_mm[flagged], reach_mm)
+    return np.concatenate([flagged, free[~scan.flagged[free]]])
 
 
-def _in_company(points_mm: Floats, deep: Bools) -> Bools:
-    """The deep points that have at least two deep ones among their six nearest."""
-    _, nearest = cKDTree(points_mm).query(points_mm, min(7, len(points_mm)))
-    return np.asarray(deep & (deep[nearest[:, 1:]].sum(axis=1) >= 2))
+def _deep(skin: Skin, scan: Scan, near: Ints, film_sigmas: float) -> Bools:
+    """Which of the points `near` lie below the twin by more than `film_sigmas` of both uncertainties.
+
+    Chance alone takes a few sound points that deep, but not two of the six neighbours as well.
+    """
+    depth_mm = -skin.closest(scan.points_mm[near])[0]
+    deep = depth_mm > film_sigmas * np.hypot(scan.sigma_mm[near], scan.twin_sigma_mm)
+    _, index = cKDTree(scan.points_mm[near]).query(scan.points_mm[near], min(7, len(near)))
+    return np.asarray(deep & (deep[index[:, 1:]].sum(axis=1) >= 2))
 
 
 def _sound_points(scan: Scan, shallow: Ints, raw_mm: Floats) -> Floats:
@@ -185,13 +219,13 @@ def _thinned(points_mm: Floats, cell_mm: float) -> Floats:
     return np.column_stack(sums) / count[:, None]
 
 
-def _local_quadrics(centres_mm: Floats, raw_mm: Floats) -> tuple[Floats, Floats, Floats]:
-    """Feet (n, 3), frames (n, 3, 3) and bending (n, 3) of least-squares quadrics at the centres.
+def _local_quadrics(points_mm: Floats) -> tuple[Floats, Floats, Floats]:
+    """Feet (n, 3), frames (n, 3, 3) and bending (n, 3) of least-squares quadrics at the points.
 
     The first frame is the principal axes of the neighbours, the second the quadric's own tangent plane.
     """
-    distance_mm, index = cKDTree(raw_mm).query(centres_mm, min(FIT_POINTS, len(raw_mm)))
-    off = raw_mm[index] - centres_mm[:, None]
+    distance_mm, index = cKDTree(points_mm).query(points_mm, min(FIT_POINTS, len(points_mm)))
+    off = points_mm[index] - points_mm[:, None]
     weight = np.maximum(1.0 - (distance_mm / (1.2 * distance_mm[:, -1:])) ** 2, 0.0) ** 2
     mean = (weight[..., None] * off).sum(axis=1, keepdims=True) / weight.sum(axis=1)[:, None, None]
     spread = np.einsum("nk,nki,nkj->nij", weight, off - mean, off - mean)
@@ -203,7 +237,7 @@ def _local_quadrics(centres_mm: Floats, raw_mm: Floats) -> tuple[Floats, Floats,
         ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
         right = np.einsum("nk,nki,nk->ni", weight, design, height)
         fit = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
-        feet_mm = centres_mm + fit[:, :1] * frames[:, 2]
+        feet_mm = points_mm + fit[:, :1] * frames[:, 2]
         frames = _tilted(frames, fit[:, 1:3])
     return feet_mm, frames, fit[:, 3:]
 
@@ -220,14 +254,21 @@ def _tilted(frames: Floats, slope: Floats) -> Floats:
 def _lost_skin(
     skin: Skin, raw_mm: Floats, sound_mm: Floats, pitch_mm: float, support_mm: float
 ) -> tuple[Floats, Floats]:
-    """Samples, and their normals, of the twin's skin that no scan point supports, next to the break."""
+    """Samples, and their normals, of the twin's skin that is lost, from the break on.
+
+    Lost is what has no sound point near it, or lies nearer to the broken surface.
+    """
     margin_mm = 2.0 + float(np.linalg.norm(np.ptp(raw_mm, axis=0)))
     points, normals = skin.samples(pitch_mm, raw_mm.min(axis=0) - margin_mm, raw_mm.max(axis=0) + margin_mm)
-    bare = cKDTree(sound_mm).query(points)[0] > support_mm if len(sound_mm) else np.ones(len(points), bool)
+    touch_mm = support_mm + 2.0 * pitch_mm
+    to_break_mm = cKDTree(raw_mm).query(points, distance_upper_bound=touch_mm)[0]
+    bare = np.ones(len(points), bool)
+    if len(sound_mm):
+        bare = cKDTree(sound_mm).query(points)[0] > np.minimum(to_break_mm, support_mm)
     points, normals = points[bare], normals[bare]
     pairs = cKDTree(points).query_pairs(2.0 * pitch_mm, output_type="ndarray")
-    count, piece = connected_components(_graph(pairs, np.ones(len(pairs)), len(points)), directed=False)
-    touching = cKDTree(raw_mm).query(points)[0] <= support_mm + 2.0 * pitch_mm
+    _, piece = connected_components(_graph(pairs, np.ones(len(pairs)), len(points)), directed=False)
+    touching = np.isfinite(to_break_mm[bare])
     kept = np.isin(piece, np.unique(piece[touching]))
     if not kept.any():
         raise CannotRepair("no skin is missing above the broken surface")

@@ -17,7 +17,7 @@ class AxisCalibration:
     """Where the table stands: `x_scanner = T_scanner_table0 @ about_z(angle) @ x_table`.
 
     The table frame has +Z along the axis. `sigma_offset_mm` is the standard uncertainty of the axis' place
-    across itself, `sigma_tilt_deg` that of its direction.
+    in each direction across itself, `sigma_tilt_deg` that of its tilt in each.
     """
 
     T_scanner_table0: Floats  # (4, 4)
@@ -47,7 +47,7 @@ def calibrate_axis(sphere_centres_mm: Floats, angles_deg: Floats) -> AxisCalibra
     sigma_mm = _scatter_mm(sphere_centres_mm - design @ np.stack([p_mm, a_mm, b_mm]))
     radius_mm = float(np.sqrt(np.linalg.norm(np.cross(a_mm, b_mm))))
     covariance = np.linalg.inv(design.T @ design) * sigma_mm**2
-    offset_mm, circle_mm = np.sqrt(covariance[0, 0]), np.sqrt(covariance[1, 1] + covariance[2, 2])
+    offset_mm, circle_mm = np.sqrt(covariance[0, 0]), np.sqrt(0.5 * (covariance[1, 1] + covariance[2, 2]))
     if not radius_mm > 10.0 * circle_mm:
         raise CannotMeasure(f"axis: circle of {radius_mm:.3f} mm, known to {circle_mm:.3f} mm only")
     return AxisCalibration(

@@ -3,7 +3,10 @@
 A part is seen on the chart after its own rigid motion in the plane has been undone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,7 +14,7 @@ from scipy.spatial import cKDTree
 from geometry.errors import BadInput
 from geometry.kernels.profile import project
 from geometry.nominal import Nominal, NominalSection
-from geometry.types import Floats, Ints
+from geometry.types import Bools, Floats, Ints
 
 NODES = 2048  # of a profile; half on each side between the edges
 _TUKEY = 4.685  # standard deviations; 95 % efficient on Gaussian residuals
@@ -23,8 +26,12 @@ class SectionSettings:
 
     max_gap_mm: float = 1.5  # an arc without points wider than this was not measured
     band_mm: float = 6.0  # neighbouring z on each side that takes part
-    layer_mm: float = 1.5  # pitch of the nominal sections inside the band
-    knot_mm: float = 0.7  # spline knots along the sides ...
+    layer_mm: float = 6.0  # of height that three nominal sections bridge, unless a parabola ...
+    blend_mm: float = 0.0005  # ... is more than this off: then less,
+    thinnest_layer_mm: float = 0.4  # down to this; ...
+    blend_limit_mm: float = 0.005  # ... what is then still more than this off takes no part
+    steepest: float = 1.0  # mm outward per mm of height: what lies flatter belongs to a fillet or a tip face
+    knot_mm: float = 1.0  # spline knots along the sides ...
     edge_refinement: float = 4.0  # ... and this many times closer at the edges
     edge_mm: float = 2.0  # half width of the refined arc
     z_knot_mm: float = 4.0
@@ -43,13 +50,16 @@ class SectionSettings:
 class Chart:
     """Nominal sections of a band, as curves of corresponding nodes: node 0 trailing, NODES / 2 leading edge.
 
-    Node coordinate in [0, NODES) and z address the surface; nodes crowd at the edges.
+    Node coordinate in [0, NODES) and z address the surface; nodes crowd at the edges. Sections come in
+    threes, low, halfway, high, which a parabola in height bridges.
     """
 
-    z_mm: Floats  # (k,), ascending
-    nodes_mm: Floats  # (k, NODES, 2)
+    z_mm: Floats  # (2 k + 1,), ascending
+    nodes_mm: Floats  # (2 k + 1, NODES, 2)
+    trusted: Bools  # (k, NODES) the parabola holds: not so in a tip's rounding
     here: int  # the layer of the section itself
     arc_mm: Floats  # (NODES + 1,) along the section itself, closed
+    side: Ints  # (NODES,) as in `NominalSection`: 0 leading edge, 1 suction, 2 trailing edge, 3 pressure
     seeds: Ints
     corner_mm: Floats
     cell_mm: float
@@ -77,6 +87,19 @@ class Chart:
         growth: Floats = (self.nodes_mm[high] - self.nodes_mm[low]) / (self.z_mm[high] - self.z_mm[low])
         return growth
 
+    def upright(self, node: Floats, z_mm: Floats, steepest: float) -> tuple[Floats, Bools]:
+        """Steepness of the nominal, mm outward per mm of height, at points of the chart; and which are good.
+
+        Good: not steeper than `steepest`, and where the chart is trusted.
+        """
+        normals = np.stack([outward_normals(curve) for curve in self.nodes_mm])
+        growth = (np.gradient(self.nodes_mm, self.z_mm, axis=0) * normals).sum(axis=2)
+        layer = np.interp(z_mm, self.z_mm, np.arange(len(self.z_mm), dtype=np.float64))
+        at = node.astype(np.int64)
+        steepness = growth[np.rint(layer).astype(np.int64), at]
+        trusted = self.trusted[np.minimum(layer.astype(np.int64) // 2, len(self.trusted) - 1), at]
+        return steepness, trusted & (np.abs(steepness) <= steepest)
+
     def arc_at(self, node: Floats) -> Floats:
         """Arc length on the section of node coordinates."""
         return np.interp(node, np.arange(NODES + 1), self.arc_mm)
@@ -88,17 +111,34 @@ def unroll(nominal: Nominal, z_mm: float, reach_mm: float, settings: SectionSett
     high = min(z_mm + reach_mm, nominal.z_max_mm)
     if not low <= z_mm <= high or high - low < 1e-6:
         raise BadInput(f"section z = {z_mm} mm is outside the airfoil")
-    below = np.linspace(low, z_mm, 1 + int(np.ceil((z_mm - low) / settings.layer_mm)))
-    above = np.linspace(z_mm, high, 1 + int(np.ceil((high - z_mm) / settings.layer_mm)))
-    heights = np.unique(np.concatenate([below, above]))
-    here = int(np.argmin(np.abs(heights - z_mm)))
-    sections = [nominal.section(float(z)) for z in heights]
-    fractions = [_fractions(length, settings) for length in _side_lengths(sections[here])]
-    nodes = np.stack([_resample(section, fractions) for section in sections])
+    fractions = [_fractions(length, settings) for length in _side_lengths(nominal.section(z_mm))]
+
+    @cache
+    def nodes_at(height_mm: float) -> Floats:
+        return _resample(nominal.section(height_mm), fractions)
+
+    count = [int(np.ceil(part / settings.layer_mm)) for part in (z_mm - low, high - z_mm)]
+    ends = np.concatenate([np.linspace(low, z_mm, count[0] + 1), np.linspace(z_mm, high, count[1] + 1)])
+    threes = [
+        three
+        for bottom, top in pairwise(np.unique(ends).tolist())
+        for three in _bridge(bottom, top, nodes_at, settings)
+    ]
+    heights = [float(low), *(height for three in threes for height in three.above_mm)]
+    nodes = np.stack([nodes_at(height) for height in heights])
+    here = heights.index(z_mm)
     seeds, corner, cell = _seeds(nodes[here])
     arc = np.concatenate([[0.0], np.cumsum(_lengths(nodes[here]))])
     return Chart(
-        z_mm=heights, nodes_mm=nodes, here=here, arc_mm=arc, seeds=seeds, corner_mm=corner, cell_mm=cell
+        z_mm=np.array(heights),
+        nodes_mm=nodes,
+        trusted=np.stack([three.wrong_mm <= settings.blend_limit_mm for three in threes]),
+        here=here,
+        arc_mm=arc,
+        side=_sides(nominal.section(z_mm), nodes[here]),
+        seeds=seeds,
+        corner_mm=corner,
+        cell_mm=cell,
     )
 
 
@@ -106,6 +146,28 @@ def outward_normals(curve_mm: Floats) -> Floats:
     """Unit outward normals (m, 2) of a closed counter-clockwise curve, from each node's neighbours."""
     along = np.roll(curve_mm, -1, axis=0) - np.roll(curve_mm, 1, axis=0)
     return np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Three:
+    """An interval of height bridged by a parabola through three sections."""
+
+    above_mm: tuple[float, float]  # halfway and high
+    wrong_mm: Floats  # (NODES,) how far a section between them is off
+
+
+def _bridge(
+    low_mm: float, high_mm: float, nodes_at: Callable[[float], Floats], settings: SectionSettings
+) -> list[_Three]:
+    """The intervals from `low_mm` to `high_mm`, each confirmed by the section a quarter of the way up."""
+    middle, quarter = 0.5 * (low_mm + high_mm), 0.75 * low_mm + 0.25 * high_mm
+    found = nodes_at(quarter)
+    blend = 0.375 * nodes_at(low_mm) + 0.75 * nodes_at(middle) - 0.125 * nodes_at(high_mm)
+    wrong = np.abs(((found - blend) * outward_normals(found)).sum(axis=1))
+    if wrong.max() <= settings.blend_mm or high_mm - low_mm < 2.0 * settings.thinnest_layer_mm:
+        return [_Three(above_mm=(middle, high_mm), wrong_mm=wrong)]
+    below = _bridge(low_mm, middle, nodes_at, settings)
+    return [*below, *_bridge(middle, high_mm, nodes_at, settings)]
 
 
 def _lengths(curve_mm: Floats) -> Floats:
@@ -146,6 +208,11 @@ def _resample(section: NominalSection, fractions: list[Floats]) -> Floats:
     first, second = _side_lengths(section)
     at = np.concatenate([first * fractions[0], first + second * fractions[1]])
     return np.column_stack([np.interp(at, arc, closed[:, 0]), np.interp(at, arc, closed[:, 1])])
+
+
+def _sides(section: NominalSection, nodes_mm: Floats) -> Ints:
+    """The nominal's own side of each node."""
+    return section.side[cKDTree(section.curve_mm).query(nodes_mm)[1]]
 
 
 def _seeds(curve_mm: Floats) -> tuple[Ints, Floats, float]:

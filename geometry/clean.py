@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.errors import BadInput
-from geometry.kernels.graph import component_sizes
+from geometry.kernels.graph import component_sizes, only_mutual
 from geometry.kernels.neighbours import k_nearest
 from geometry.kernels.quadric import plane_heights
 from geometry.types import Bools, Cloud, Floats, Ints
@@ -14,7 +14,7 @@ from geometry.types import Bools, Cloud, Floats, Ints
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanSettings:
     neighbours: int = 12
-    sparse_ratio: float = 4.0  # mean distance to the neighbours over the median of all: a flying pixel
+    sparse_ratio: float = 6.0  # of the median distance to neighbours: farther points are not joined
     outlier_sigmas: float = 6.0  # height over the neighbours' plane, in their own scatter and in sigma
     smallest_cluster: int = 30  # points; fewer, apart from everything else, are no surface
     most_points: int = 1_000_000
@@ -45,14 +45,14 @@ def _select(cloud: Cloud, kept: Bools | Ints) -> Cloud:
 
 
 def _strays(nearest: Ints, distance_mm: Floats, settings: CleanSettings) -> Bools:
-    """Points far from their neighbours, and small groups that no neighbour of theirs joins to the rest."""
-    spacing_mm = distance_mm[:, 1:].mean(axis=1)
-    near_mm = spacing_mm[nearest[:, (settings.neighbours + 1) // 2]]
-    reach_mm = settings.sparse_ratio * np.maximum(np.median(spacing_mm), near_mm)
-    sparse = spacing_mm > reach_mm
-    apart = (distance_mm > reach_mm[:, None]) | sparse[:, None] | sparse[nearest]
-    joined = np.where(apart, -1, nearest)
-    return np.asarray(sparse | (component_sizes(joined) < settings.smallest_cluster))
+    """Small groups of points, and single ones, that are no near neighbours of the rest.
+
+    Two points are joined if each is among the nearest of the other: a flying pixel has neighbours on the
+    surface, but these have nearer ones of their own.
+    """
+    reach_mm = settings.sparse_ratio * float(np.median(distance_mm[:, 1:].mean(axis=1)))
+    joined = np.where(distance_mm <= reach_mm, only_mutual(nearest), -1)
+    return component_sizes(joined) < settings.smallest_cluster
 
 
 def _outliers(cloud: Cloud, nearest: Ints, settings: CleanSettings) -> Bools:

@@ -6,7 +6,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geometry.broken import Skin
+from geometry.broken import Skin, frames_along
 from geometry.errors import BadInput
 from geometry.nominal import ZONE_ORDER, Nominal
 from geometry.register import Alignment
@@ -162,9 +162,7 @@ def _largest_empty(nominal: Nominal, own: Ints, empty_mm: Floats, marks: _Marks)
 
 def _nine(centres_mm: Floats, normals: Floats, step_mm: float) -> Floats:
     """Each centre and eight places round it in its tangent plane, centre after centre: (9 n, 3)."""
-    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normals, first)
+    first, second = np.moveaxis(frames_along(normals)[:, :2], 1, 0)
     u, v = (part.reshape(1, 9, 1) for part in np.meshgrid(*2 * ([-step_mm, 0.0, step_mm],)))
     return np.asarray((centres_mm[:, None] + u * first[:, None] + v * second[:, None]).reshape(-1, 3))
 
@@ -185,7 +183,7 @@ def _seen_skin(
 def _on_twin(twin: Twin, points_mm: Floats) -> Floats:
     """Where the twin has carried points (n, 3) of the nominal's surface."""
     rest = Mesh(vertices_mm=twin.mesh.vertices_mm - twin.displacement_mm, faces=twin.mesh.faces)
-    corner = rest.faces[Skin(rest).closest(points_mm)[1]]
+    corner = rest.faces[Skin(rest).closest(points_mm)[2]]
     a, b, c = np.moveaxis(rest.vertices_mm[corner], 1, 0)
     ab, ac, ap = b - a, c - a, points_mm - a
     bb, bc, cc = ((x * y).sum(axis=1) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
@@ -206,6 +204,6 @@ def _absent(points_mm: Floats, twin: Twin | None, repairs: RepairVolume | None, 
         if patch.broken_gap_mm <= max_gap_mm:
             low, high = patch.mesh.vertices_mm.min(axis=0), patch.mesh.vertices_mm.max(axis=0)
             boxed = ((on_twin_mm >= low - ON_PATCH_MM) & (on_twin_mm <= high + ON_PATCH_MM)).all(axis=1)
-            distance_mm, face = Skin(patch.mesh).closest(on_twin_mm[boxed])
+            distance_mm, _, face = Skin(patch.mesh).closest(on_twin_mm[boxed])
             absent[boxed] |= (np.abs(distance_mm) <= ON_PATCH_MM) & patch.outer[face]
     return absent

@@ -170,6 +170,8 @@ class Chord:
 
     length: Estimate
     stagger: Estimate
+    nose_mm: Floats
+    tail_mm: Floats
 
 
 def chord(curve_mm: Floats, le: Edge, te: Edge) -> Chord:
@@ -192,35 +194,71 @@ def chord(curve_mm: Floats, le: Edge, te: Edge) -> Chord:
     swing = (back.radius_mm * back.slope + front.radius_mm * front.slope) / lever
     angle = float(np.arctan2(ends[1], ends[0]))
     return Chord(
-        length=Estimate(value=length, gradient=gradient), stagger=Estimate(value=angle, gradient=swing)
+        length=Estimate(value=length, gradient=gradient),
+        stagger=Estimate(value=angle, gradient=swing),
+        nose_mm=front.point_mm,
+        tail_mm=back.point_mm,
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Thick:
-    """Nodes about the thickest part of the nominal section, on its two sides."""
+class CamberLine:
+    """Inscribed circles along the mean camber line, from the leading to the trailing edge."""
 
-    first: Ints
-    second: Ints
-
-
-def thick_part(nominal_mm: Floats, le: int) -> Thick:
-    """Where the nominal is at least 95 % of its maximum thickness."""
-    m = len(nominal_mm)
-    margin = m // 40
-    first = np.arange(margin, le - margin)
-    second = np.arange(le + margin, m - margin)
-    radius, contact = inscribed_circles(nominal_mm, outward_normals(nominal_mm), first, second)
-    near = radius >= 0.95 * radius.max()
-    return Thick(
-        first=first[near], second=np.arange(contact[near].min() - margin, contact[near].max() + margin + 1)
-    )
+    centre_mm: Floats  # (k, 2)
+    radius_mm: Floats  # (k,)
+    node: Ints  # (k,) touched on the side that runs from the trailing to the leading edge
+    contact: Ints  # (k,) touched across
 
 
-def max_thickness(curve_mm: Floats, thick: Thick) -> Estimate:
-    """Diameter of the largest inscribed circle; both of its contacts push it."""
-    radius, contact = inscribed_circles(curve_mm, outward_normals(curve_mm), thick.first, thick.second)
+def camber_line(curve_mm: Floats, le: int) -> CamberLine:
+    """The mean camber line of a curve whose trailing edge is node 0 and whose leading edge is node `le`.
+
+    Within 2 % of the perimeter of either edge there are no circles: an edge's rounding has one only.
+    """
+    share = node_shares(curve_mm)
+    arc = np.cumsum(share) - share[0]
+    margin = 0.02 * share.sum()
+    node = np.flatnonzero((arc > margin) & (arc < arc[le] - margin))[::-1].copy()
+    across = np.flatnonzero((arc > arc[le] + margin) & (arc < share.sum() - margin))
+    normals = outward_normals(curve_mm)
+    radius, contact = inscribed_circles(curve_mm, normals, node, across)
+    centre = curve_mm[node] - radius[:, None] * normals[node]
+    return CamberLine(centre_mm=centre, radius_mm=radius, node=node, contact=contact)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pair:
+    """Nodes on the first side of the section, and nodes on the second side across from them."""
+
+    node: Ints
+    across: Ints
+
+
+def thick_part(camber: CamberLine) -> Pair:
+    """Where a nominal is at least 95 % of its maximum thickness."""
+    near = camber.radius_mm >= 0.95 * camber.radius_mm.max()
+    return Pair(node=np.sort(camber.node[near]), across=_span(camber.contact[near]))
+
+
+def _span(nodes: Ints) -> Ints:
+    """The nodes from the first to the last, and a few more on both sides."""
+    return np.arange(nodes.min() - 20, nodes.max() + 21)
+
+
+def thickness(curve_mm: Floats, pair: Pair) -> Estimate:
+    """Diameter of the largest inscribed circle that touches the curve in nodes of the pair."""
+    normals = outward_normals(curve_mm)
+    radius, contact = inscribed_circles(curve_mm, normals, pair.node, pair.across)
     best = int(np.argmax(radius))
+    node, across = pair.node[best], contact[best]
+    wedge = -float(normals[node] @ normals[across])  # 1 where the two sides are parallel
     gradient = np.zeros(len(curve_mm))
-    gradient[[thick.first[best], contact[best]]] = 1.0
+    gradient[[node, across]] = 2.0 * wedge / (1.0 + wedge), 2.0 / (1.0 + wedge)
     return Estimate(value=2.0 * float(radius[best]), gradient=gradient)
+
+
+def gauge(camber: CamberLine, from_mm: Floats, along: Floats, distance_mm: float) -> Pair:
+    """The pair of the nominal circle whose centre is `distance_mm` from a point along a direction."""
+    near = int(np.argmin(np.abs((camber.centre_mm - from_mm) @ along - distance_mm)))
+    return Pair(node=camber.node[near : near + 1], across=_span(camber.contact[near : near + 1]))

@@ -1,12 +1,17 @@
-"""Which points of an aligned cloud lie on damage, told by the signed residuals of their neighbourhoods."""
+"""Which points of an aligned cloud lie on damage: off the nominal, and abruptly so."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from geometry.errors import BadInput
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean
 from geometry.types import Bools, Floats, Ints
+
+TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
+BLENDED = 6  # nodes around a point whose local fits are blended there
+IRLS_STEPS = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -14,10 +19,16 @@ class MaskSettings:
     neighbours: int = 16
     high: float = 5.0  # of the scale: certainly damaged
     low: float = 2.5  # damaged if joined to what certainly is
+    form_mm: float = 0.15  # smooth deviations up to this are form, not damage
+    form_points: int = 15_000  # of the cloud, to find them
+    form_nodes: int = 1500  # local fits
+    form_window: int = 200  # points in each
 
     def __post_init__(self) -> None:
-        if not (self.neighbours >= 4 and 0.0 < self.low <= self.high):
+        if not (self.neighbours >= 4 and 0.0 < self.low <= self.high and self.form_mm > 0.0):
             raise BadInput(f"mask: {self} contradicts itself")
+        if not 20 <= self.form_window <= self.form_nodes <= self.form_points:
+            raise BadInput(f"mask: {self} has too few points for a form")
 
 
 def robust_sigma(values: Floats) -> float:
@@ -25,14 +36,62 @@ def robust_sigma(values: Floats) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def damaged(distance_mm: Floats, neighbours: Ints, floor_mm: float, settings: MaskSettings) -> Bools:
-    """The points (n,) whose neighbourhood lies off the nominal, with one ring around them.
+def damaged(residual_mm: Floats, neighbours: Ints, floor_mm: float, settings: MaskSettings) -> Bools:
+    """The points (n,) whose neighbourhood lies off the surface, with one ring around them.
 
-    `distance_mm` (n,) is signed, `neighbours` (n, k) of each point. The mean over a neighbourhood keeps what
-    damage does and averages noise away; its robust scatter, but at least `floor_mm`, is the scale. From
-    seeds beyond `high` scales the flag grows over the neighbour graph down to `low`.
+    `residual_mm` (n,) is signed, `neighbours` (n, k) of each point. The mean over a neighbourhood keeps
+    what damage does and averages noise away; its robust scatter, but at least `floor_mm`, is the scale.
+    From seeds beyond `high` scales the flag grows over the neighbour graph down to `low`.
     """
-    smooth_mm = neighbourhood_mean(distance_mm, neighbours[:, 1:])
+    smooth_mm = neighbourhood_mean(residual_mm, neighbours[:, 1:])
     scale_mm = max(robust_sigma(smooth_mm), floor_mm)
     size = np.abs(smooth_mm) / scale_mm
     return np.asarray(dilate(grow(size > settings.high, size > settings.low, neighbours), neighbours))
+
+
+def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: MaskSettings) -> Floats:
+    """The smooth part (n,) of the signed distances: what service or making did to the form.
+
+    Local linear fits over a few millimetres, robust against what is abrupt, blended between their nodes.
+    Distances beyond `form_mm`, or four robust sigmas of all where a blade is bent further, take no part:
+    within a wide damage the form is that of its surroundings.
+    """
+    place = np.column_stack([points_mm, TURN_MM * normals])
+    limit_mm = max(settings.form_mm, 4.0 * robust_sigma(distance_mm))
+    near = np.flatnonzero(np.abs(distance_mm) <= limit_mm)
+    if len(near) < settings.form_window:
+        return np.zeros(len(points_mm))
+    chosen = near[:: max(1, len(near) // settings.form_points)]
+    nodes = chosen[:: max(1, len(chosen) // settings.form_nodes)]
+    coefficients = _local_fits(place[nodes], place[chosen], distance_mm[chosen], settings.form_window)
+    return _blend(place, place[nodes], coefficients)
+
+
+def _local_fits(nodes: Floats, place: Floats, distance_mm: Floats, window: int) -> Floats:
+    """Value and gradient (m, 4) at each node (m, 6): weighted least squares with Tukey's weights."""
+    apart, members = cKDTree(place).query(nodes, k=window)
+    closeness = np.exp(-4.5 * (apart / apart[:, -1:]) ** 2)  # the last member at three sigmas
+    offset_mm = place[members][:, :, :3] - nodes[:, None, :3]
+    design = np.concatenate([np.ones((*members.shape, 1)), offset_mm], axis=2)
+    values = distance_mm[members]
+    ridge = np.diag([1e-9, *np.full(3, 1e-3)]) * window  # across the surface the gradient is unknown
+    weights = closeness
+    for _ in range(IRLS_STEPS):
+        weighted = design * weights[:, :, None]
+        normal_matrix = np.einsum("mki,mkj->mij", weighted, design) + ridge
+        right = np.einsum("mki,mk->mi", weighted, values)
+        coefficients = np.linalg.solve(normal_matrix, right[:, :, None])[:, :, 0]
+        residual = values - np.einsum("mki,mi->mk", design, coefficients)
+        scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=1, keepdims=True), 1e-6)
+        weights = closeness * np.maximum(1.0 - (residual / (4.685 * scale)) ** 2, 0.0) ** 2
+    return np.asarray(coefficients)
+
+
+def _blend(place: Floats, nodes: Floats, coefficients: Floats) -> Floats:
+    """The local fits at each point (n,), weighted by closeness over the nearest nodes."""
+    apart, nearest = cKDTree(nodes).query(place, k=min(BLENDED, len(nodes)))
+    weights = np.maximum(1.0 - (apart / (1.05 * apart[:, -1:] + 1e-9)) ** 2, 0.0) ** 2
+    offset_mm = place[:, None, :3] - nodes[nearest][:, :, :3]
+    fits = coefficients[nearest]
+    values = fits[:, :, 0] + np.einsum("nki,nki->nk", offset_mm, fits[:, :, 1:])
+    return np.asarray((weights * values).sum(axis=1) / weights.sum(axis=1))

@@ -191,24 +191,29 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
         raise CannotMeasure("no sound points near the nominal section")
     knots = place_knots(chart, settings)
     keep, fit = _robust_fit(band, knots, _penalty(chart, knots, settings), settings)
-    near = keep & (np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0)
-    gaps = find_gaps(chart, chart.arc_at(band.node[near]), settings.max_gap_mm)
+    near = np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0
+    arc = _supporting(chart.arc_at(band.node[near]), keep[near], settings.max_gap_mm)
+    gaps = find_gaps(chart, arc, settings.max_gap_mm)
     return _profile(chart, motion, knots, fit, gaps, float(np.median(band.sigma_mm)))
 
 
 def _onto_chart(
     points_mm: Floats, sigma_mm: Floats, chart: Chart, motion: Motion, settings: SectionSettings
 ) -> Band:
-    """The points within `capture_mm` of the moved nominal."""
+    """The points within `capture_mm` of the moved nominal, where it stands upright enough.
+
+    On a slanted surface the distance in the plane is longer than along the normal, and so is its sigma.
+    """
     back = motion.undo(points_mm)
     foot = chart.project(back)
-    near = np.abs(foot[:, 1]) <= settings.capture_mm
+    steepness, upright = chart.upright(foot[:, 0], back[:, 2], settings.steepest)
+    near = upright & (np.abs(foot[:, 1]) <= settings.capture_mm)
     height = (back[near, 2] - chart.section_z_mm) / settings.band_mm
     return Band(
         node=foot[near, 0],
         z_mm=back[near, 2],
         deviation_mm=foot[near, 1],
-        sigma_mm=sigma_mm[near],
+        sigma_mm=sigma_mm[near] * np.hypot(1.0, steepness[near]),
         columns=rigid_columns(back[near], foot[near, 2:], motion.pivot_mm, height),
     )
 
@@ -249,6 +254,18 @@ def _profile(
         fit=fit,
         columns=columns,
     )
+
+
+def _supporting(arc_mm: Floats, keep: Bools, width_mm: float) -> Floats:
+    """Arcs of the kept points where most points within `width_mm` were kept.
+
+    Where the profile passes most points by, those that it meets by chance do not support it.
+    """
+    every, kept = np.sort(arc_mm), np.sort(arc_mm[keep])
+    half = np.array([[-0.5], [0.5]]) * width_mm
+    total = np.diff(np.searchsorted(every, kept + half), axis=0)[0]
+    good = np.diff(np.searchsorted(kept, kept + half), axis=0)[0]
+    return kept[2 * good >= total]
 
 
 def whole_gap(chart: Chart) -> tuple[Gap, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 from geometry.coarse import Coarse, CoarseSettings, find_pose
 from geometry.errors import BadInput, CannotRegister
 from geometry.fit import Fit, every, felt, fit_kept, fit_robust, information
-from geometry.mask import MaskSettings, damaged, robust_sigma
+from geometry.mask import MaskSettings, damaged, form_of, robust_sigma
 from geometry.nominal import Closest, Nominal
 from geometry.surface import k_nearest
 from geometry.transforms import apply
@@ -44,7 +44,7 @@ class RegisterSettings:
     least_points: int = 200
     robust_points: int = 8000  # of the cloud, for the robust fit
     fit_points: int = 250_000  # of the cloud, for mask and least squares: 0.0005 mm of noise at most
-    rounds: int = 3  # of mask and least squares
+    rounds: int = 2  # of mask and least squares
     explained_mm: float = 0.3
 
     def __post_init__(self) -> None:
@@ -104,7 +104,8 @@ def _damage_of(
     cloud: Cloud, found: Closest, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
 ) -> Bools:
     floor_mm = float(np.median(cloud.sigma_mm)) / np.sqrt(neighbours.shape[1])
-    return damaged(found.distance_mm, neighbours, floor_mm, settings.mask)
+    form_mm = form_of(found.points_mm, found.normals, found.distance_mm, settings.mask)
+    return damaged(found.distance_mm - form_mm, neighbours, floor_mm, settings.mask)
 
 
 def _alignment(

@@ -12,7 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from geometry.broken import BrokenSurface, Scan, Skin, find_broken_surface
+from geometry.broken import BrokenSurface, Scan, Skin, find_broken_surface, frames_along
+from geometry.columns import volume_by_columns
 from geometry.damage import Damage, DamageKind
 from geometry.errors import BadInput, CannotRepair
 from geometry.kernels.implicit import blend_quadrics
@@ -21,9 +22,11 @@ from geometry.register import Alignment
 from geometry.solid import check_solid, volume_mm3
 from geometry.transforms import apply, inverse
 from geometry.twin import Twin
-from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Mesh, Zone
+from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh, NotMeasured, Zone
 
 FAR = 1e3  # field value of a node whose side is known but whose distance is not
+FLAT_COSINE = float(np.cos(np.deg2rad(20.0)))  # a break at a lower angle to the skin runs out flat
+BORDER_POINTS = 24  # sound points that tell how the skin meets the patch
 COLLAR = 3  # nodes that the cut body reaches past the skin
 
 
@@ -38,7 +41,7 @@ class RepairSettings:
     max_nodes: int = 12_000_000
     sliver_fraction: float = 0.01  # pieces smaller than this share of the largest are dropped
     agreement: float = 0.05  # largest difference of the two volumes, relative
-    agreement_mm3: float = 0.05  # and below this it does not count
+    agreement_mm3: float = 0.05  # and added to that
 
     def __post_init__(self) -> None:
         if not (self.max_gap_mm > 0.0 and self.film_sigmas > 0.0 and self.resolution >= 5.0):
@@ -57,6 +60,8 @@ class Patch:
     volume_mm3: Measurand
     volume_check_mm3: float  # by an independent second method
     broken_gap_mm: float  # diameter of the largest empty disc on the broken surface
+    border_step_mm: Measured  # largest height of the sound skin off the patch's, along the border
+    border_angle_deg: Measured  # and largest angle between them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,7 +82,7 @@ def find_repairs(
     failures: dict[int, str] = {}
     if missing:
         skin, solid = Skin(twin.mesh), _solid(twin.mesh).as_original()
-        scan = _scan(cloud, alignment, damages)
+        scan = _scan(twin, cloud, alignment, damages)
     for i in missing:
         try:
             patches.append(_patch(i, damages[i], twin, skin, solid, scan, settings))
@@ -91,12 +96,40 @@ def to_scan_frame(mesh: Mesh, alignment: Alignment) -> Mesh:
     return Mesh(vertices_mm=apply(inverse(alignment.T_nominal_scan), mesh.vertices_mm), faces=mesh.faces)
 
 
-def _scan(cloud: Cloud, alignment: Alignment, damages: Sequence[Damage]) -> Scan:
+def with_allowance(patch: Patch, allowance_mm: float) -> Mesh:
+    """The patch grown outward by `allowance_mm` (>= 0) beyond the twin's skin, to be machined off.
+
+    Each vertex of the outer skin moves along its mean normal, far enough to clear every face around it.
+    """
+    if not 0.0 <= allowance_mm < np.inf:
+        raise BadInput(f"a machining allowance of {allowance_mm} mm")
+    mesh, corners = patch.mesh, patch.mesh.faces[patch.outer].ravel()
+    a, b, c = np.moveaxis(mesh.vertices_mm[mesh.faces[patch.outer]], 1, 0)
+    cross = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    count = len(mesh.vertices_mm)
+    normal = _unit(np.column_stack([np.bincount(corners, cross[:, i], count) for i in range(3)]))
+    clear = np.ones(count)
+    np.minimum.at(clear, corners, (_unit(cross) * normal[corners]).sum(axis=1))
+    reach_mm = allowance_mm / np.maximum(clear, 0.5)
+    return Mesh(vertices_mm=mesh.vertices_mm + reach_mm[:, None] * normal, faces=mesh.faces)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300))
+
+
+def _scan(twin: Twin, cloud: Cloud, alignment: Alignment, damages: Sequence[Damage]) -> Scan:
     points_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
     flagged = np.zeros(len(cloud), bool)
     for damage in damages:
         flagged[damage.points] = True
-    return Scan(points_mm=points_mm, sigma_mm=cloud.sigma_mm, flagged=flagged)
+    seen = twin.sigma_mm[twin.supported]
+    return Scan(
+        points_mm=points_mm,
+        sigma_mm=np.maximum(cloud.sigma_mm, twin.noise_mm),
+        flagged=flagged,
+        twin_sigma_mm=float(np.median(seen if len(seen) else twin.sigma_mm)),
+    )
 
 
 def _patch(
@@ -110,11 +143,12 @@ def _patch(
     if not gap_mm <= settings.max_gap_mm:
         raise CannotRepair(f"a hole of {gap_mm:.2f} mm in the scan of the broken surface")
     volume = volume_mm3(mesh)
-    check = _volume_by_columns(broken, skin)
-    allowed = max(settings.agreement * volume, settings.agreement_mm3)
+    check = volume_by_columns(broken, skin)
+    allowed = settings.agreement * volume + settings.agreement_mm3
     if not abs(volume - check) <= allowed:
         raise CannotRepair(f"two ways to its volume disagree: {volume:.3f} and {check:.3f} mm3")
     sigma = _volume_sigma(mesh, outer, twin, broken, abs(volume - check), dropped_mm3)
+    step, angle = _border(mesh, outer, broken)
     return Patch(
         damage=index,
         zone=damage.zone,
@@ -124,6 +158,8 @@ def _patch(
         volume_mm3=Measurand(name="volume_mm3", value=volume, sigma=sigma, unit="mm3"),
         volume_check_mm3=check,
         broken_gap_mm=gap_mm,
+        border_step_mm=step,
+        border_angle_deg=angle,
     )
 
 
@@ -166,7 +202,7 @@ def _cut_body(broken: BrokenSurface, skin: Skin, settings: RepairSettings) -> Me
 def _lost_field(
     grid: _Grid, broken: BrokenSurface, skin: Skin, settings: RepairSettings
 ) -> tuple[Floats, Bools]:
-    """A field that is positive where metal is lost, continued past the skin; and the lost nodes in the twin."""
+    """A field that is positive where metal is lost and just outside it; and the lost nodes in the twin."""
     reach_mm = 0.5 * settings.max_gap_mm + 2.0 * grid.step_mm
     field, nearest_mm = blend_quadrics(
         grid.shape,
@@ -180,7 +216,7 @@ def _lost_field(
     )
     band = np.isfinite(nearest_mm)
     inside = _inside(grid, skin)
-    _keep_sound_skin(field, nearest_mm, inside & band, grid, broken, skin)
+    _end_flat_rim(field, nearest_mm, inside & band, grid, broken)
     lost = inside & ((band & (field > 0.0)) | _lost_beyond_band(inside & ~band, band & inside, field))
     beyond = ndimage.binary_dilation(lost, np.ones((3, 3, 3), bool), COLLAR)
     return np.where(band, field, np.where(lost | (beyond & ~inside), FAR, -FAR)), lost
@@ -191,23 +227,21 @@ def _inside(grid: _Grid, skin: Skin) -> Bools:
     return np.asarray(nodes_inside(start, height_mm, float(grid.origin_mm[2]), grid.step_mm, grid.shape))
 
 
-def _keep_sound_skin(
-    field: Floats, nearest_mm: Floats, band: Bools, grid: _Grid, broken: BrokenSurface, skin: Skin
-) -> None:
-    """Where the broken surface runs out flat, end it: no film of metal is lost over points of the sound skin.
+def _end_flat_rim(field: Floats, nearest_mm: Floats, band: Bools, grid: _Grid, broken: BrokenSurface) -> None:
+    """End the loss, in `field`, where the break runs out nearly flat and sound skin has been seen beyond it.
 
-    A node counts as lost only if it is about as near to the broken surface as to the sound skin, or deeper
-    than the film.
+    There the continued break and the twin cross anywhere or nowhere. Elsewhere their crossing is the edge of
+    the break, sharper than the points show it, and stays.
     """
-    if not len(broken.sound_mm):
+    _, nearest = cKDTree(broken.points_mm).query(broken.rim.feet_mm)
+    flat = (broken.rim.normals * broken.frames[nearest, 2]).sum(axis=1) > FLAT_COSINE
+    if not flat.any():
         return
     margin_mm = 1.5 * float(np.median(broken.spacing_mm))
-    at = np.argwhere(band & (field > 0.0) & (nearest_mm > margin_mm))
-    node_mm = grid.origin_mm + grid.step_mm * at
-    excess = margin_mm - (nearest_mm[tuple(at.T)] - cKDTree(broken.sound_mm).query(node_mm)[0])
-    at, node_mm, excess = at[excess < 0.0], node_mm[excess < 0.0], excess[excess < 0.0]
-    below = -skin.closest(node_mm)[0] - 1.5 * broken.film_mm
-    field[tuple(at.T)] = np.minimum(field[tuple(at.T)], np.maximum(excess, below))
+    at = np.nonzero(band & (field > 0.0) & (nearest_mm > margin_mm))
+    node_mm = grid.origin_mm + grid.step_mm * np.column_stack(at)
+    to_rim_mm = cKDTree(broken.rim.feet_mm[flat]).query(node_mm)[0]
+    field[at] = np.minimum(field[at], margin_mm + to_rim_mm - nearest_mm[at])
 
 
 def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools:
@@ -294,19 +328,49 @@ def _from_original(raw: Any, origin: int) -> Bools:
     return mask
 
 
-def _face_areas(mesh: Mesh, faces: Bools) -> tuple[Floats, Floats]:
-    """Centroids (n, 3) and areas (n,) of the chosen faces."""
-    a, b, c = np.moveaxis(mesh.vertices_mm[mesh.faces[faces]], 1, 0)
-    return (a + b + c) / 3.0, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+def _faces(mesh: Mesh, chosen: Bools) -> tuple[Floats, Floats]:
+    """Middles (n, 3) and areas (n,) of the chosen faces."""
+    a, b, c = np.moveaxis(mesh.vertices_mm[mesh.faces[chosen]], 1, 0)
+    return (a + b + c) / 3.0, 0.5 * np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
 def _broken_gap(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> float:
     """Diameter of the largest disc on the patch's broken side that holds no scan point."""
-    middle_mm, area_mm2 = _face_areas(mesh, ~outer)
-    if not len(middle_mm):
+    if outer.all():
         raise CannotRepair("the patch has no broken side")
-    known_mm = np.concatenate([broken.raw_mm, broken.sound_mm])
-    return 2.0 * float(cKDTree(known_mm).query(middle_mm)[0].max())
+    known_mm = np.concatenate([broken.raw_mm, broken.rim.points_mm])
+    return 2.0 * float(np.max(cKDTree(known_mm).query(_faces(mesh, ~outer)[0])[0]))
+
+
+def _border(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> tuple[Measured, Measured]:
+    """Largest step (mm) and angle (deg) between the patch's outer skin and the sound skin that it meets.
+
+    At each place of the border a plane through the heights of the nearest `BORDER_POINTS` sound points.
+    """
+    rim = broken.rim
+    if len(rim.points_mm) < BORDER_POINTS:
+        unseen = NotMeasured(reason=f"{len(rim.points_mm)} scan points on the sound skin round the patch")
+        return unseen, unseen
+    at_mm = mesh.vertices_mm[np.intersect1d(mesh.faces[outer], mesh.faces[~outer])]
+    _, index = cKDTree(rim.feet_mm).query(at_mm, BORDER_POINTS)
+    height = ((rim.points_mm - rim.feet_mm) * rim.normals).sum(axis=1)[index]
+    across = frames_along(rim.normals[index[:, 0]])[:, :2]
+    off = np.einsum("nij,nkj->nki", across, rim.feet_mm[index] - at_mm[:, None])
+    inverse = np.linalg.pinv(np.concatenate([np.ones((*index.shape, 1)), off], axis=2))
+    plane = np.einsum("nik,nk->ni", inverse, height)
+    step, slope = np.abs(plane[:, 0]), np.linalg.norm(plane[:, 1:], axis=1)
+    sigma = broken.sigma_mm * np.linalg.norm(inverse, axis=2)
+    i, j = int(step.argmax()), int(slope.argmax())
+    steepness = float(np.linalg.norm(sigma[j, 1:]))
+    return (
+        Measurand(name="border_step_mm", value=float(step[i]), sigma=float(sigma[i, 0]), unit="mm"),
+        Measurand(
+            name="border_angle_deg",
+            value=float(np.rad2deg(np.arctan(slope[j]))),
+            sigma=float(np.rad2deg(steepness)),
+            unit="deg",
+        ),
+    )
 
 
 def _volume_sigma(
@@ -315,54 +379,14 @@ def _volume_sigma(
     """Standard uncertainty of the volume, mm3.
 
     The twin's error is taken as the same all over the lost skin; the noise of the scan points averages
-    out; what the two methods disagree by and what was dropped stand for the shape between the points.
+    out; where the patch is thinner than the film its edge is a matter of chance; what the two methods
+    disagree by and what was dropped stand for the shape between the points.
     """
-    middle_mm, area_mm2 = _face_areas(mesh, outer)
+    middle_mm, area_mm2 = _faces(mesh, outer)
     _, nearest = cKDTree(twin.mesh.vertices_mm).query(middle_mm)
     from_twin = float((twin.sigma_mm[nearest] * area_mm2).sum())
     from_noise = broken.sigma_mm * broken.area_mm2 / np.sqrt(len(broken.raw_mm))
-    return float(np.sqrt(from_twin**2 + from_noise**2 + difference_mm3**2 / 12.0 + dropped_mm3**2 / 3.0))
-
-
-def _volume_by_columns(broken: BrokenSurface, skin: Skin) -> float:
-    """The lost volume (mm3) by another way: columns along the way out, from the raw points to the twin's skin.
-
-    Uses neither normals nor the implicit surface nor the mesh of the patch: the height of the broken surface
-    in a column is that of a plane through the nearest raw points in projection, and a column counts where
-    it leaves the twin through lost skin.
-    """
-    R = _axes(broken.facing)
-    triangles = skin.triangles_mm @ R
-    raw, lost = broken.raw_mm @ R, broken.lost_mm @ R
-    ends = np.concatenate([raw, lost])
-    low, high = ends.min(axis=0) - 0.5, ends.max(axis=0) + 0.5
-    pitch_mm = float(np.sqrt(np.prod(high[:2] - low[:2]) / 40_000.0))
-    shape = (int((high[0] - low[0]) / pitch_mm) + 1, int((high[1] - low[1]) / pitch_mm) + 1)
-    start, height = column_crossings(triangles, low[:2], pitch_mm, shape)
-    column = np.repeat(np.arange(len(start) - 1), np.diff(start))[::2]
-    enter, leave = height[::2], height[1::2]
-    at = low[:2] + pitch_mm * np.column_stack([column // shape[1], column % shape[1]])
-    exits = np.column_stack([at, leave])
-    gone = cKDTree(lost).query(exits)[0] <= broken.lost_reach_mm
-    at, enter, leave = at[gone], enter[gone], leave[gone]
-    length = np.clip(leave - np.maximum(enter, _heights(at, raw)), 0.0, None)
-    return float(length.sum()) * pitch_mm**2
-
-
-def _axes(direction: Floats) -> Floats:
-    """A rotation (3, 3) whose third column is `direction`."""
-    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
-    first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(direction, first), direction])
-
-
-def _heights(at_mm: Floats, points_mm: Floats) -> Floats:
-    """Height (n,) over each place (n, 2): a weighted plane through the 10 points nearest in projection."""
-    distance_mm, index = cKDTree(points_mm[:, :2]).query(at_mm, min(10, len(points_mm)))
-    weight = 1.0 / (distance_mm**2 + 1e-2 * distance_mm[:, -1:] ** 2)
-    off = points_mm[index, :2] - at_mm[:, None]
-    design = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
-    normal = np.einsum("nk,nki,nkj->nij", weight, design, design)
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    right = np.einsum("nk,nki,nk->ni", weight, design, points_mm[index, 2])
-    return np.asarray(np.linalg.solve(normal, right[..., None])[:, 0, 0])
+    to_break_mm, _ = cKDTree(_faces(mesh, ~outer)[0]).query(middle_mm)
+    from_film = broken.film_mm * float(area_mm2[to_break_mm < broken.film_mm].sum()) / np.sqrt(12.0)
+    from_shape = np.hypot(difference_mm3 / np.sqrt(12.0), dropped_mm3 / np.sqrt(3.0))
+    return float(np.linalg.norm([from_twin, from_noise, from_film, from_shape]))

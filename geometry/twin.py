@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 
 from geometry.errors import CannotFitTwin
-from geometry.freeform import COMPONENTS, Freeform, Lattice, bending_energy, fit_freeform, lattice_over
+from geometry.freeform import COMPONENTS, Freeform, Lattice, fit_freeform, lattice_over, swell
 from geometry.kernels.graph import grow
 from geometry.nominal import Nominal
 from geometry.offset import Nodes, Offset, fit_offset, scatter_nodes
@@ -18,7 +17,7 @@ from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh
 
 CREASE_COSINE = 0.94  # corner normals that differ more belong to different sides of an edge
 PATCH_CELLS = 0.4  # what the lattice cannot follow is alike over this part of a cell
-FIRST_STIFFNESS = 1e3  # of the free form, before the data set it
+FIRST_STIFFNESS = 1e4  # of the free form, before the data set it
 NO_NOISE_MM = 1e-5  # least scatter believed
 
 
@@ -33,7 +32,7 @@ class TwinSettings:
     cells: int = 100  # of the free-form lattice over the airfoil's box
     rounds: int = 8  # of the free-form fit, at most
     points: int = 50_000  # subsample of the free-form fit
-    tangential: float = 1e-3  # pull against sliding, relative to the pull along the normal
+    slide_mm: float = 1.0  # the surface may well have moved this far along itself
     damage_mm: float = 0.03
     nodes: int = 9000  # of the offset field; its spacing follows from the airfoil's area
     draws: int = 64  # posterior draws behind the sigmas
@@ -105,7 +104,6 @@ class _Ground:
 
     nominal: Nominal
     lattice: Lattice
-    bending: sp.csr_array
     refined: Refined
     nodes: Nodes
     graph: Ints  # (nodes, k) neighbours
@@ -120,7 +118,6 @@ def _prepare(nominal: Nominal, points: int, settings: TwinSettings) -> _Ground:
     return _Ground(
         nominal=nominal,
         lattice=lattice,
-        bending=bending_energy(lattice),
         refined=refined,
         nodes=nodes,
         graph=nodes.graph(),
@@ -283,17 +280,20 @@ def _smooth_round(
     held = votes.count > 0.0
     share_mm2 = votes.noise_mm**2 / np.maximum(votes.count, 1.0)
     misfit_mm2 = max(_spread(residual[held]) ** 2 - float(np.median(share_mm2[held])), NO_NOISE_MM**2)
-    weights = 1.0 / (share_mm2 + ground.patch_nodes * misfit_mm2)
+    expected_mm = 0.1 * settings.damage_mm  # the nominal's facets and normals are no better
+    if field is not None:
+        expected_mm = max(expected_mm, float(np.sqrt(misfit_mm2)))
+    weights = 1.0 / (share_mm2 + ground.patch_nodes * expected_mm**2)
     weights *= _tukey(residual, np.sqrt(misfit_mm2 + share_mm2)) * held
     return fit_freeform(
         ground.lattice,
-        ground.bending,
         votes.centre_mm[held],
         ground.nodes.normals[held],
         votes.along_mm[held],
         weights[held],
         stiffness=stiffness,
-        tangential=settings.tangential,
+        slide=1.0 / (ground.patch_nodes * settings.slide_mm**2),
+        form_mm=settings.damage_mm,
     )
 
 
@@ -384,7 +384,7 @@ def _vertices(
     vertex, normals = _sides(refined)
     carry = offset.nodes.interpolation(vertices[vertex], normals)
     shift, swelling = field.shift(vertices)
-    along_mm = swelling[vertex] + carry @ offset.value_mm
+    along_mm = swelling[vertex] * swell(normals) + carry @ offset.value_mm
     near = _largest(vertex, np.asarray(carry @ np.ones(carry.shape[1])), count) > 0.5
     variance = np.maximum(carry @ surface.sigma_mm**2, float(surface.sigma_mm.min()) ** 2)
     sigma_mm = np.sqrt(_largest(vertex, variance, count))

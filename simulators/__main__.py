@@ -7,18 +7,27 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
-from simulators.cell import BadJob, LoadedPart, Order, RecordedParts, SimCell, Studio, read_job
+from simulators.cell import (
+    BadJob,
+    LoadedPart,
+    Order,
+    RecordedParts,
+    SimCell,
+    Studio,
+    StudioFailed,
+    read_job,
+)
 from simulators.faults import Faults
 from simulators.plc import PlcProgram, run_plc
 from simulators.scanner import ScannerPorts, serve_scanner
 from simulators.serve import ByteServer, serve_pty, serve_tcp
-from simulators.station_files import Addresses, copy_inputs, free_port, write_station
+from simulators.station_files import Addresses, free_port, write_station
 from simulators.turntable import TurntableSession
 
 HOST = "127.0.0.1"
@@ -30,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         asyncio.run(serve(options))
-    except (BadJob, OSError, ValueError, KeyError) as error:
+    except (BadJob, StudioFailed, OSError) as error:
         print(f"simulators: {error}", file=sys.stderr)
         return 2
     return 0
@@ -38,19 +47,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 async def serve(options: argparse.Namespace) -> None:
     """Serve the cell until SIGTERM or SIGINT; prints its addresses once everything listens."""
-    ended = asyncio.Event()
+    serving = asyncio.ensure_future(_serve(options))
     for interruption in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(interruption, ended.set)
+        asyncio.get_running_loop().add_signal_handler(interruption, serving.cancel)
+    with contextlib.suppress(asyncio.CancelledError):
+        await serving
+
+
+async def _serve(options: argparse.Namespace) -> None:
+    failed = asyncio.Event()
     async with AsyncExitStack() as stack:
         cell = _cell(options, stack)
         await cell.load(0)
         addresses = await _listen(cell, options, stack)
         if options.write_config:
-            _write_config(options, addresses, cell)
+            calibration, plan = await cell.parts.write_files(options.write_config.parent)
+            write_station(options.write_config, addresses, cell.scanner.serial, calibration, plan)
         if "plc" not in options.without:
-            _start_plc(cell, options, addresses, stack, ended)
+            _start_plc(cell, options, addresses, stack, failed)
         print(addresses.line() if options.json else _readable(addresses), flush=True)
-        await ended.wait()
+        await failed.wait()
 
 
 def _cell(options: argparse.Namespace, stack: AsyncExitStack) -> SimCell:
@@ -66,13 +82,14 @@ def _cell(options: argparse.Namespace, stack: AsyncExitStack) -> SimCell:
 def _parts(options: argparse.Namespace) -> Studio | RecordedParts:
     if options.replay:
         return RecordedParts(tuple(read_job(folder) for folder in options.replay))
-    return Studio(Order(preset=options.preset, seed=options.seed, nominal=options.nominal))
+    order = Order(preset=options.preset, seed=options.seed, nominal=options.nominal)
+    return Studio(order, ahead="plc" not in options.without and options.parts != 1)
 
 
 async def _listen(cell: SimCell, options: argparse.Namespace, stack: AsyncExitStack) -> Addresses:
     """Put every device that is not left out on the wire."""
     port = _ports(options.ports)
-    tcp, pty = port["turntable"], ""
+    tcp, pty = port["turntable"], None
     if "turntable" not in options.without:
         tcp, pty = await _serve_turntable(cell, tcp, stack)
     ports = ScannerPorts(modbus=port["modbus"], control=port["control"], data=port["data"])
@@ -83,7 +100,7 @@ async def _listen(cell: SimCell, options: argparse.Namespace, stack: AsyncExitSt
     return Addresses(
         host=HOST,
         turntable_tcp=tcp,
-        turntable_pty=pty or f"socket://{HOST}:{tcp}",
+        turntable_pty=pty,
         modbus=ports.modbus,
         control=ports.control,
         data=ports.data,
@@ -123,7 +140,7 @@ def _start_plc(
     options: argparse.Namespace,
     addresses: Addresses,
     stack: AsyncExitStack,
-    ended: asyncio.Event,
+    failed: asyncio.Event,
 ) -> None:
     """Start the PLC. The time stands in for its retentive memory: no two runs use the same sequence."""
     now = int(time.time())
@@ -134,10 +151,10 @@ def _start_plc(
         stack,
     )
     # It runs for ever: its end is a failure, and must not pass for a quiet PLC.
-    task.add_done_callback(lambda _: ended.set())
+    task.add_done_callback(lambda _: failed.set())
 
 
-def _run(work: Any, stack: AsyncExitStack) -> "asyncio.Task[None]":
+def _run(work: Coroutine[Any, Any, None], stack: AsyncExitStack) -> "asyncio.Task[None]":
     """A task that lives as long as the cell, and whose failure then comes out."""
     task: asyncio.Task[None] = asyncio.get_running_loop().create_task(work)
 
@@ -150,23 +167,6 @@ def _run(work: Any, stack: AsyncExitStack) -> "asyncio.Task[None]":
     return task
 
 
-def _write_config(options: argparse.Namespace, addresses: Addresses, cell: SimCell) -> None:
-    """station.toml, and beside it calibration and recipe: of this cell, or those of the replayed job."""
-    path: Path = options.write_config
-    folder = path.parent
-    folder.mkdir(parents=True, exist_ok=True)
-    calibration, plan = "calibration.toml", "blades/sim/plan.toml"
-    if options.replay:
-        calibration, plan = copy_inputs(options.replay[0], folder)
-    else:
-        from simulators.calibration_file import write_calibration
-        from simulators.presets import rig_for, write_recipe
-
-        write_calibration(folder / calibration, rig_for(options.seed, options.nominal), options.seed)
-        write_recipe((folder / plan).parent, options.preset, options.seed, options.nominal)
-    write_station(path, addresses, cell.scanner.serial, calibration, plan)
-
-
 def _open_log(path: Path | None, stack: AsyncExitStack) -> TextIO | None:
     return stack.enter_context(path.open("a", encoding="utf-8")) if path else None
 
@@ -177,13 +177,14 @@ def _write_truth(log: TextIO | None, part: LoadedPart) -> None:
 
 
 def _write_line(log: TextIO, line: dict[str, Any]) -> None:
-    log.write(json.dumps(line) + "\n")
-    log.flush()
+    with contextlib.suppress(OSError):  # the cell outlives whoever reads its log
+        log.write(json.dumps(line) + "\n")
+        log.flush()
 
 
 def _readable(addresses: Addresses) -> str:
     return (
-        f"turntable  {HOST}:{addresses.turntable_tcp} and {addresses.turntable_pty}\n"
+        f"turntable  {HOST}:{addresses.turntable_tcp}, pty {addresses.turntable_pty}\n"
         f"scanner    modbus {addresses.modbus}, control {addresses.control}, data {addresses.data}\n"
         f"plc        polls the station at {HOST}:{addresses.station_modbus}"
     )

@@ -8,7 +8,7 @@ import numpy as np
 from simulators.sections import chord_ends_mm, resampled
 from simulators.solids import Floats, NotASolid, Solid, loop_area_mm2, slice_loops
 
-LEVELS = 200  # slices in which the platform is looked for
+LEVELS = 140  # slices in which the platform is looked for
 EDGE_LEVELS = 41
 JUMP = 6.0  # times the usual growth of a section's area from one slice to the next
 
@@ -117,6 +117,10 @@ def find_airfoil(solid: Solid, z_min_mm: float | None = None, z_max_mm: float | 
         z_min = low + rise * (z_max - low)
     else:
         z_min = z_min_mm
+    if not bottom <= z_min < z_max <= top:
+        raise NotASolid(
+            f"airfoil: z {z_min:g} to {z_max:g} mm is not within the mesh, {bottom:g} to {top:g} mm"
+        )
     seat = z_min - 0.01 * (z_max - z_min)
     le, te = _edge_lines(solid, z_min, z_max)
     return Airfoil(solid=solid, z_min_mm=z_min, z_max_mm=z_max, seat_mm=seat, le_mm=le, te_mm=te)

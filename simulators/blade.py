@@ -77,7 +77,8 @@ class BladeShape:
     def _shape(self, x: Floats, z_mm: Floats, chord_mm: Floats) -> Floats:
         thin = 1.0 - self.thickness_taper * z_mm / self.span_mm
         inner = [coefficient * thin for coefficient in self.thickness]
-        ends = [np.sqrt(2.0 * radius / chord_mm) for radius in (self.le_radius_mm, self.te_radius_mm)]
+        steep = np.hypot(1.0, self.camber)  # the camber line is longer than the chord by this at its ends
+        ends = [np.sqrt(2.0 * radius * steep / chord_mm) for radius in (self.le_radius_mm, self.te_radius_mm)]
         coefficients = [ends[0], *inner, ends[1]]
         degree = len(coefficients) - 1
         terms = [a * comb(degree, k) * x**k * (1.0 - x) ** (degree - k) for k, a in enumerate(coefficients)]
@@ -135,7 +136,7 @@ class Wear:
     @cached_property
     def _bumps(self) -> tuple[float, float]:
         rng = np.random.default_rng([self.seed, 11])
-        return float(rng.uniform(0.8, 1.0)), float(rng.uniform(0.8, 1.0))
+        return float(rng.uniform(0.9, 1.1)), float(rng.uniform(0.9, 1.1))
 
     def offset_mm(self, theta: Floats, height: Floats) -> Floats:
         """The displacement outward along the section normal; `height` is z over the span."""

@@ -56,21 +56,21 @@ def break_off(airfoil: Airfoil, cuts: Sequence[Cut]) -> tuple[Solid, tuple[Damag
     Raises `NotASolid` when a cut misses the blade or severs it in two.
     """
     blade = to_manifold(airfoil.solid)
-    truths = []
+    chips = []
     for cut in cuts:
         blade = blade.as_original()
         cutter = to_manifold(cut.cutter)
-        removed = blade ^ cutter
         rest = blade - cutter
-        truths.append(_truth(airfoil, cut.zone, removed, from_manifold(rest), blade.original_id()))
+        chips.append((cut.zone, blade ^ cutter, rest, blade.original_id()))
         blade = rest
     if len(blade.decompose()) != 1:
         raise NotASolid("a damage severs the blade")
-    return from_manifold(blade) if cuts else airfoil.solid, tuple(truths)
+    truths = tuple(_truth(airfoil, *chip) for chip in chips)
+    return from_manifold(blade) if cuts else airfoil.solid, truths
 
 
 def _truth(
-    airfoil: Airfoil, zone: ZoneName, removed: manifold3d.Manifold, after: Solid, blade_id: int
+    airfoil: Airfoil, zone: ZoneName, removed: manifold3d.Manifold, rest: manifold3d.Manifold, blade_id: int
 ) -> DamageTruth:
     if removed.is_empty():
         raise NotASolid(f"{zone}: the cutter misses the blade")
@@ -81,7 +81,7 @@ def _truth(
     return DamageTruth(
         zone=zone,
         volume_mm3=float(removed.volume()),
-        depth_mm=_depth_mm(airfoil, zone, after, chip.vertices_mm[chip.faces[skin]], fracture),
+        depth_mm=_depth_mm(airfoil, zone, rest, chip.vertices_mm[chip.faces[skin]], fracture),
         area_mm2=_area_mm2(chip.vertices_mm[chip.faces[skin]]),
         centroid_mm=_centroid_mm(chip),
         z_low_mm=float(heights.min()),
@@ -89,11 +89,14 @@ def _truth(
     )
 
 
-def _depth_mm(airfoil: Airfoil, zone: ZoneName, after: Solid, skin_mm: Floats, fracture_mm: Floats) -> float:
+def _depth_mm(
+    airfoil: Airfoil, zone: ZoneName, rest: manifold3d.Manifold, skin_mm: Floats, fracture_mm: Floats
+) -> float:
     if zone == "tip":
         return float(airfoil.solid.vertices_mm[:, 2].max() - fracture_mm[:, 2].min())
     if zone == "surface":
         return _normal_depth_mm(skin_mm, fracture_mm)
+    after = from_manifold(rest)
     levels = np.linspace(fracture_mm[:, 2].min(), fracture_mm[:, 2].max(), EDGE_SLICES + 2)[1:-1]
     return max(_edge_loss_mm(airfoil, zone, after, float(z)) for z in levels)
 
@@ -198,17 +201,20 @@ def edge_nick(
     width_mm: float,
     rng: np.random.Generator,
 ) -> Cut:
-    """A notch through the edge, about `depth_mm` deep in the section and `width_mm` long on the edge."""
+    """A notch through the edge, about `depth_mm` deep in the section and `width_mm` long on the edge.
+
+    Its flank toward the tip is the gentle one, so that a scanner that looks down sees all of it.
+    """
     z_mm = airfoil.height_mm(span_fraction)
     le, te = airfoil.edge_points_mm(z_mm)
     edge, far = (le, te) if zone == "leading_edge" else (te, le)
     outward = _unit(edge - far)
     across = np.array([-outward[1], outward[0], 0.0])
     rough = _roughness(rng, 0.04 * depth_mm, width_mm)
-    half = 0.5 * width_mm
+    below, above = 0.3 * width_mm, 0.7 * width_mm
 
     def relief(u: Floats, v: Floats) -> Floats:
-        return depth_mm * (1.0 - np.abs(u / half) ** 2.5) + rough(u, v)
+        return depth_mm * (1.0 - (u / np.where(u < 0.0, below, above)) ** 2) + rough(u, v)
 
     return Cut(
         zone=zone,
@@ -216,7 +222,7 @@ def edge_nick(
             edge,
             np.array([0.0, 0.0, 1.0]),
             across,
-            u_mm=(-1.1 * half, 1.1 * half),
+            u_mm=(-1.1 * below, 1.1 * above),
             v_mm=(-0.2 * airfoil.chord_mm, 0.2 * airfoil.chord_mm),
             relief=relief,
             out_mm=0.2 * airfoil.chord_mm,

@@ -113,7 +113,7 @@ class PlcProgram:
     _heard_at_s: float = float("-inf")
     _beaten_at_s: float = float("-inf")
     _resume_at_s: float = float("-inf")
-    _reset_at_s: float = float("-inf")
+    _faulty_since_s: float | None = None
     _answered_at_s: float = float("-inf")
     _wrong_reads: int = 0
     _routed: bool = False
@@ -246,14 +246,13 @@ class PlcProgram:
             self.out = replace(self.out, echo_station_heartbeat=image.heartbeat)
 
     def _reset_faults(self, image: StationImage, now_s: float) -> None:
-        """While the station shows FAULT, press reset for one second of every five."""
+        """While the station shows FAULT, press reset for the second second of every five."""
+        self._lower(Ctrl.RESET_FAULT)
         if not image.shows(StatusBits.FAULT):
-            self._lower(Ctrl.RESET_FAULT)
-            self._reset_at_s = now_s + _PAUSE_S
-        elif now_s >= self._reset_at_s + _PAUSE_S:
-            self._lower(Ctrl.RESET_FAULT)
-            self._reset_at_s = now_s + _RESET_PERIOD_S
-        elif now_s >= self._reset_at_s:
+            self._faulty_since_s = None
+            return
+        self._faulty_since_s = now_s if self._faulty_since_s is None else self._faulty_since_s
+        if 1.0 <= (now_s - self._faulty_since_s) % _RESET_PERIOD_S < 2.0:
             self._raise(Ctrl.RESET_FAULT)
 
     def _raise(self, bit: Ctrl) -> None:
@@ -289,8 +288,11 @@ async def run_plc(
     clock = asyncio.get_running_loop().time
     client = AsyncModbusTcpClient(host, port=port, timeout=_CALL_S, retries=0, reconnect_delay=0)
     loading: asyncio.Task[str] | None = None
+    me = asyncio.current_task()
+    assert me is not None
     try:
-        while True:
+        # The client can swallow a cancellation that comes together with its answer: ask for it.
+        while not me.cancelling():
             if program.wants_part and loading is None:
                 loading = asyncio.ensure_future(load(program.index))
             if loading is not None and loading.done():

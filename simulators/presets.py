@@ -73,7 +73,7 @@ def make_part(blade: NominalBlade, preset: str, seed: int, index: int = 0) -> Si
     serial = serial_of(seed, index)
     if preset == "HOLD-wrong-part":
         return _wrong_part(blade, serial, seed, rng)
-    worn = worn_blade(blade, service_wear(rng))
+    worn = worn_blade(blade, service_wear(blade, rng))
     optics = OpticsSettings(blind=(_dirt(blade, worn, rng),) if preset == "HOLD-hole" else ())
     cuts = CUTS[preset](blade, worn, rng) if preset in CUTS else []
     return assemble(blade, worn, cuts, preset=preset, serial=serial, seed=seed, optics=optics, rng=rng)
@@ -84,12 +84,13 @@ def serial_of(seed: int, index: int) -> str:
     return f"SIM-{abs(seed) % 10**9:04d}-{index % 10**9:04d}"
 
 
-def service_wear(rng: np.random.Generator) -> Wear:
-    """Wear well inside the serviceable limits of form and sections."""
+def service_wear(blade: NominalBlade, rng: np.random.Generator) -> Wear:
+    """Wear well inside the serviceable limits of form and sections, less on a smaller blade."""
+    s = blade.scale
     return Wear(
         wave_mm=0.005,
-        bump_mm=float(rng.uniform(0.04, 0.07)),
-        bend_mm=float(rng.uniform(-0.08, 0.08)),
+        bump_mm=float(rng.uniform(0.04, 0.07)) * s,
+        bend_mm=float(rng.uniform(-0.08, 0.08)) * s,
         untwist_deg=float(rng.uniform(-0.10, 0.10)),
         seed=int(rng.integers(2**31)),
     )
@@ -109,7 +110,7 @@ def broken_corner(blade: NominalBlade, worn: WornBlade, rng: np.random.Generator
 def repairable_nick(blade: NominalBlade, worn: WornBlade, rng: np.random.Generator) -> CutList:
     """A nick of the leading edge, repairable."""
     s = blade.scale
-    depth, width = rng.uniform(1.2, 1.9) * s, rng.uniform(4.0, 6.0) * s
+    depth, width = rng.uniform(0.9, 1.3) * s, rng.uniform(5.0, 6.0) * s
     return [edge_nick(worn.airfoil, "leading_edge", rng.uniform(0.6, 0.7), depth, width, rng)]
 
 
@@ -130,7 +131,7 @@ def beyond_repair(blade: NominalBlade, worn: WornBlade, rng: np.random.Generator
     """A nick or a corner that is deeper than anybody may repair."""
     s = blade.scale
     if rng.random() < 0.5:
-        height, depth, width = rng.uniform(0.3, 0.7), rng.uniform(5.0, 6.0) * s, rng.uniform(6.0, 8.0) * s
+        height, depth, width = rng.uniform(0.3, 0.7), rng.uniform(3.4, 4.0) * s, rng.uniform(12.0, 14.0) * s
         return [edge_nick(worn.airfoil, "leading_edge", height, depth, width, rng)]
     return [tip_corner(worn.airfoil, rng.uniform(20.0, 23.0) * s, rng.uniform(0.5, 0.6), rng)]
 

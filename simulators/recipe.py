@@ -26,14 +26,14 @@ SECTION_LIMITS: Limits = {
 FORM_LIMITS: Limits = {"deviation_mm": (0.25, 0.80)}
 DEPTH_LIMITS_MM: Limits = {  # of the thesis' blade; others in proportion to their chord
     "tip": (0.50, 15.0),
-    "leading_edge": (0.50, 3.0),
-    "trailing_edge": (0.50, 3.0),
+    "leading_edge": (0.50, 2.0),
+    "trailing_edge": (0.50, 2.0),
     "surface": (0.30, 2.0),
 }
 VOLUME_LIMITS_MM3: Limits = {
-    "tip": (5.0, 900.0),
-    "leading_edge": (3.0, 120.0),
-    "trailing_edge": (3.0, 120.0),
+    "tip": (5.0, 1500.0),
+    "leading_edge": (3.0, 200.0),
+    "trailing_edge": (3.0, 200.0),
     "surface": (3.0, 150.0),
 }
 

@@ -9,7 +9,7 @@ import logging
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import cast
 
 from pymodbus.constants import ExcCodes
@@ -52,36 +52,35 @@ Expose = Callable[[], Awaitable[Callable[[Stamp], bytes]]]
 
 @dataclass(slots=True, kw_only=True)
 class ScannerDevice:
-    """The sensor: running or not, exposing or not, and the stamp of its last frame."""
+    """The sensor: running or not, the triggers it has yet to serve, and the stamp of its last frame."""
 
     serial: int = SERIAL
     running: bool = False
-    exposing: bool = False
+    pending: int = 0
     frame_index: int = 0
     frame_time_us: int = 0
     lose_triggers: int = 0  # the next so many are accepted and then forgotten
 
     def trigger(self) -> Status:
-        """Whether a trigger is taken: only while running, and one at a time."""
-        if not self.running or self.exposing:
+        """Whether a trigger is taken: only while running; one that comes during an exposure waits for it."""
+        if not self.running:
             return Status.INVALID_STATE
         if self.lose_triggers > 0:
             self.lose_triggers -= 1
         else:
-            self.exposing = True
+            self.pending += 1
         return Status.OK
 
-    def next_stamp(self, now_s: float) -> Stamp:
+    def next_stamp(self, exposed_at_s: float) -> Stamp:
         """The stamp of the frame that is ready now; time goes up even on a clock that stands."""
         self.frame_index += 1
-        self.frame_time_us = max(round(now_s * 1e6), self.frame_time_us + 1)
-        self.exposing = False
+        self.frame_time_us = max(round(exposed_at_s * 1e6), self.frame_time_us + 1)
         return Stamp(
             frame_index=self.frame_index, timestamp_us=self.frame_time_us, scanner_serial=self.serial
         )
 
     def control(self, frame: bytes, now_s: float) -> ControlReply:
-        """The reply to a frame of the control channel; a trigger that is taken sets `exposing`."""
+        """The reply to a frame of the control channel."""
         command, _ = decode_control(frame)
         status, payload = Status.OK, b""
         if command == Control.PROTOCOL_VERSION:
@@ -143,23 +142,25 @@ class _Wire:
     expose: Expose
     clock: Callable[[], float]
     data: TcpServer | None = None
-    exposures: set[asyncio.Task[None]] = field(default_factory=set)
+    exposing: asyncio.Task[None] | None = None
 
-    def begin_exposure(self) -> None:
-        task = asyncio.get_running_loop().create_task(self._expose())
-        self.exposures.add(task)
-        task.add_done_callback(self.exposures.discard)
+    def serve_triggers(self) -> None:
+        """See that somebody takes the pictures that are due."""
+        if self.device.pending and self.exposing is None:
+            self.exposing = asyncio.get_running_loop().create_task(self._expose())
 
     async def _expose(self) -> None:
-        try:
-            group_of = await self.expose()
-        except Exception as error:  # whatever fails behind the optics, the sensor stays on the wire
-            self.device.exposing = False
-            sys.stderr.write(f"scanner: the exposure failed: {error!r}\n")
-            return
-        group = group_of(self.device.next_stamp(self.clock()))
-        assert self.data is not None
-        self.data.broadcast(group)
+        while self.device.pending:
+            began_s = self.clock()
+            try:
+                group_of = await self.expose()
+            except Exception as error:  # whatever fails behind the optics, the sensor stays on the wire
+                sys.stderr.write(f"scanner: the exposure failed: {error!r}\n")
+            else:
+                assert self.data is not None
+                self.data.broadcast(group_of(self.device.next_stamp(began_s)))
+            self.device.pending -= 1
+        self.exposing = None
 
     async def modbus(
         self,
@@ -197,10 +198,8 @@ class _ControlSession:
         return [self._answer(frame) for frame in frames]
 
     def _answer(self, frame: bytes) -> bytes:
-        was_exposing = self._wire.device.exposing
         reply = self._wire.device.control(frame, self._wire.clock())
-        if self._wire.device.exposing and not was_exposing:
-            self._wire.begin_exposure()
+        self._wire.serve_triggers()
         return encode_control_reply(reply)
 
 
@@ -228,8 +227,8 @@ async def serve_scanner(
         try:
             yield ScannerPorts(modbus=modbus, control=control.port, data=wire.data.port)
         finally:
-            for exposure in list(wire.exposures):
-                exposure.cancel()
+            if wire.exposing is not None:
+                wire.exposing.cancel()
 
 
 @asynccontextmanager

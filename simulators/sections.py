@@ -16,6 +16,7 @@ from simulators.solids import Floats, loop_area_mm2
 
 TOUCHING_POINTS = 900
 CIRCLE_STARTS = 3
+FIRST_STEP_MM = 0.02
 
 
 def centroid_mm(curve_mm: Floats) -> Floats:
@@ -68,7 +69,8 @@ def _perimeter_mm(curve_mm: Floats) -> float:
 
 
 def _lowest(height: Callable[[Floats], float], start: Floats) -> float:
-    options: Any = {"xatol": 1e-7, "fatol": 1e-9}
+    simplex = start + np.array([[0.0, 0.0], [FIRST_STEP_MM, 0.0], [0.0, FIRST_STEP_MM]])
+    options: Any = {"xatol": 1e-6, "fatol": 1e-9, "initial_simplex": simplex}
     return float(minimize(height, start, method="Nelder-Mead", options=options).fun)
 
 

@@ -11,6 +11,51 @@ from pathlib import Path
 # a port would one day be connected to itself.
 _FREE_PORTS = range(20_000, 30_000)
 
+_STATION = """\
+schema = "bladecell.station/1"
+station_id = "CELL-1"
+mode = "SIMULATION"
+
+[turntable]
+port = {turntable}
+baud = 115200
+address = 1
+reply_timeout_s = 0.5
+settle_s = 0.05
+position_tolerance_deg = 0.01
+
+[scanner]
+host = "{at.host}"
+modbus_port = {at.modbus}
+control_port = {at.control}
+data_port = {at.data}
+serial = {serial}
+capture_timeout_s = 30.0
+
+[plc]
+listen_host = "{at.host}"
+port = {at.station_modbus}
+heartbeat_timeout_s = 2.0
+accept_crc_zero = true
+
+[record]
+directory = "record"
+
+[events]
+host = "{at.host}"
+port = {at.events}
+
+[calibration]
+file = {calibration}
+max_age_days = 3650
+
+[worker]
+timeout_s = 180.0
+
+[recipes]
+1 = {plan}
+"""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Addresses:
@@ -18,7 +63,7 @@ class Addresses:
 
     host: str
     turntable_tcp: int
-    turntable_pty: str
+    turntable_pty: str | None  # None: that end is left to somebody else
     modbus: int
     control: int
     data: int
@@ -54,54 +99,16 @@ def free_port(host: str) -> int:
 
 def write_station(path: Path, addresses: Addresses, scanner_serial: int, calibration: str, plan: str) -> None:
     """Write the station configuration for these addresses; paths are relative to it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(
-        f"""\
-schema = "bladecell.station/1"
-station_id = "CELL-1"
-mode = "SIMULATION"
-
-[turntable]
-port = {json.dumps(addresses.turntable_pty)}
-baud = 115200
-address = 1
-reply_timeout_s = 0.5
-settle_s = 0.05
-position_tolerance_deg = 0.01
-
-[scanner]
-host = "{addresses.host}"
-modbus_port = {addresses.modbus}
-control_port = {addresses.control}
-data_port = {addresses.data}
-serial = {scanner_serial}
-capture_timeout_s = 30.0
-
-[plc]
-listen_host = "{addresses.host}"
-port = {addresses.station_modbus}
-heartbeat_timeout_s = 2.0
-accept_crc_zero = true
-
-[record]
-directory = "record"
-
-[events]
-host = "{addresses.host}"
-port = {addresses.events}
-
-[calibration]
-file = {json.dumps(calibration)}
-max_age_days = 3650
-
-[worker]
-timeout_s = 180.0
-
-[recipes]
-1 = {json.dumps(plan)}
-""",
-        encoding="utf-8",
+    turntable = addresses.turntable_pty or f"socket://{addresses.host}:{addresses.turntable_tcp}"
+    text = _STATION.format(
+        at=addresses,
+        turntable=json.dumps(turntable),
+        serial=scanner_serial,
+        calibration=json.dumps(calibration),
+        plan=json.dumps(plan),
     )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 def copy_inputs(job: Path, folder: Path) -> tuple[str, str]:

@@ -127,7 +127,7 @@ def ordered_part(blade: NominalBlade, order: Order) -> SimPart:
         part = make_part(blade, order.preset, order.seed)
         return replace(part, optics=replace(part.optics, noise_normal_mm=order.noise_mm))
     rng = np.random.default_rng([order.seed, 2])
-    worn = worn_blade(blade, service_wear(rng) if order.form_error else Wear(wave_mm=0.0, bump_mm=0.0))
+    worn = worn_blade(blade, service_wear(blade, rng) if order.form_error else Wear(wave_mm=0.0, bump_mm=0.0))
     kinds = ("tip", "pit") if order.damages is None else order.damages
     cuts = [cut for kind in kinds for cut in DAMAGES[kind](blade, worn, rng)]
     return assemble(

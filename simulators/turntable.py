@@ -26,6 +26,7 @@ from simulators.motion import Motion, change_speed, move_to, rest
 
 STEPS_PER_TURN = 1_536_000  # 0.000234375 deg a microstep
 _LIMIT = 1_000 * STEPS_PER_TURN
+_FASTEST = 10_000_000  # data of a speed; `move vel` may exceed maxspeed
 _LONGEST_COMMAND = 256
 _POWER_UP_STEPS = 200_000.0  # where the axis happens to stand when it is switched on
 
@@ -65,7 +66,7 @@ def _settings() -> dict[str, Setting]:
         "limit.max": str(_LIMIT),
     }
     writable = {
-        "maxspeed": ("983040", (1, 10_000_000)),
+        "maxspeed": ("983040", (1, _FASTEST)),
         "accel": ("819", (1, 100_000)),
         "comm.alert": ("0", (0, 1)),
         "comm.checksum": ("0", (0, 1)),
@@ -254,12 +255,12 @@ class TurntableDevice:
         return "0"
 
     def _turn(self, now_s: float, numbers: list[str]) -> None:
-        speed = _integer(*_exactly(1, numbers)) / SPEED_UNIT
-        if abs(speed) > self._top():
+        data = _integer(*_exactly(1, numbers))
+        if abs(data) > _FASTEST:
             raise Rejected("BADDATA")
         self._begin(now_s)
         position, now = self._motion.at(now_s)
-        self._motion = change_speed(now_s, position, now, speed, self._rate())
+        self._motion = change_speed(now_s, position, now, data / SPEED_UNIT, self._rate())
 
     def _move_arguments(self, numbers: list[str]) -> tuple[int, float, float]:
         """Distance, and the speed and acceleration that may follow it."""

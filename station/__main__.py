@@ -33,13 +33,11 @@ PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 def bad_input_is_one_line() -> Iterator[None]:
     """Ends the command with status 2 and one line on stderr when its input is at fault."""
     from geometry.errors import BadInput
-    from station.clouds import BadScan
-    from station.inspect import BadRequest
-    from station.tomlfile import BadFile
+    from station.refusal import Refusal
 
     try:
         yield
-    except (BadFile, BadScan, BadRequest, BadInput) as error:
+    except (Refusal, BadInput) as error:
         say(str(error))
         raise typer.Exit(BAD_INPUT) from None
 

@@ -71,6 +71,7 @@ KINDS = _table(
     (213, 3, "SERIAL NUMBER MISSING OR INVALID", "Check the label"),
     (214, 3, "STOPPED, the part has no verdict", "Inspect the part again"),
     (215, 3, "CALCULATION TIMEOUT", "Inspect the part again"),
+    (216, 3, "CALCULATION FAILED", "Inspect the part again; call maintenance if it repeats"),
     (305, 4, "DISK FILLING UP", "Plan to archive"),
     (306, 4, "DUPLICATE REQUEST", "None; call controls if it repeats"),
 )

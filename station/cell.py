@@ -86,7 +86,7 @@ class Cell:
     alarms: Alarms = field(default_factory=Alarms)
     turntable: Turntable | None = None
     scanner: Scanner | None = None
-    devices: AsyncExitStack = field(default_factory=AsyncExitStack)
+    links: dict[str, AsyncExitStack] = field(default_factory=dict)
     interrupt: Interrupt | None = None
     part: asyncio.Task[None] | None = None
     serving: asyncio.Task[None] | None = None
@@ -180,6 +180,11 @@ class Cell:
         """Whether a part would be accepted now."""
         return self.state is State.IDLE and self.working and not self.alarms.blocking
 
+    @property
+    def reset_asked(self) -> bool:
+        """Whether somebody wants the fault to be cleared."""
+        return self.reset_by is not None
+
     def health(self, now_s: float) -> Health:
         """What the status word says beside the handshake."""
         standing = self.state in (State.IDLE, State.SUSPENDED, State.COMPLETING, State.COMPLETE)
@@ -237,22 +242,40 @@ class Cell:
                 return
 
     async def _open_devices(self) -> None:
+        await self.connect_turntable()
+        await self.connect_scanner()
+
+    async def connect_turntable(self) -> None:
+        """Opens the turntable; raises `DriverError`."""
+        await self._unlink("turntable")
         self.device("turntable", "CONNECTING", self.config.turntable.port)
-        settings = self.config.turntable.model_dump()
-        self.turntable = await self.devices.enter_async_context(Turntable(**settings))
-        self.device("turntable", "READY", f"device {self.turntable.identity.device_id}")
+        turntable = Turntable(**self.config.turntable.model_dump())
+        await self.links["turntable"].enter_async_context(turntable)
+        self.turntable = turntable
+        self.device("turntable", "READY", f"device {turntable.identity.device_id}")
+
+    async def connect_scanner(self) -> None:
+        """Opens the scanner and sees that it runs; raises `DriverError`."""
+        await self._unlink("scanner")
         self.device("scanner", "CONNECTING", self.config.scanner.host)
-        self.scanner = await self.devices.enter_async_context(Scanner(**self.config.scanner.model_dump()))
-        await self.scanner.prepare()
+        scanner = Scanner(**self.config.scanner.model_dump())
+        await self.links["scanner"].enter_async_context(scanner)
+        await scanner.prepare()
+        self.scanner = scanner
         self.device("scanner", "READY", f"serial {self.config.scanner.serial}")
 
     async def disconnect(self) -> None:
         """Closes both devices."""
         self.turntable = self.scanner = None
-        devices, self.devices = self.devices, AsyncExitStack()
+        for device in ("turntable", "scanner"):
+            await self._unlink(device)
+
+    async def _unlink(self, device: str) -> None:
+        link = self.links.pop(device, AsyncExitStack())
+        self.links[device] = AsyncExitStack()
         with suppress(DriverError, OSError, TimeoutError):
             async with asyncio.timeout(STOP_S):
-                await devices.aclose()
+                await link.aclose()
 
     async def stop_motion(self) -> None:
         """Returns when the table stands, or after STOP_S when it does not answer."""
@@ -288,11 +311,11 @@ async def open_cell(
     calibration = read_calibration(config.calibration_path)
     recipes = {int(number): read_recipe(config, int(number)) for number in config.recipes}
     async with AsyncExitStack() as stack:
-        disk = ThreadPoolExecutor(1, "disk")
-        stack.callback(disk.shutdown)
         identity = {"station_id": config.station_id, "version": version, "mode": config.mode}
         record = Record.open(config.record_directory, station=identity, at_utc=utc_now())
         stack.callback(record.close)
+        disk = ThreadPoolExecutor(1, "disk")
+        stack.callback(disk.shutdown)  # first, and waited for: what is being written is written
         plc = await stack.enter_async_context(
             PlcLink.open(
                 config.plc.listen_host,

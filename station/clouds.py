@@ -18,6 +18,7 @@ from station.formats.malformed import Malformed
 from station.formats.pcd import pcd_points
 from station.formats.ply import ply_points
 from station.formats.text import text_points
+from station.refusal import Refusal
 
 MAX_BYTES = 1 << 30
 FARTHEST_MM = 1e6  # no scanner sees a blade a kilometre away: such a number is no coordinate
@@ -32,7 +33,7 @@ READERS: dict[str, Callable[[Path, bytes], Floats]] = {
 }
 
 
-class BadScan(Exception):
+class BadScan(Refusal):
     """A measurement file that cannot be read; the text names the file and the fault."""
 
 

@@ -12,6 +12,7 @@ from station.gates import Gate, Gates
 from station.measure import Clock, Progress, as_cloud, measure_cloud
 from station.plans import read_plan
 from station.recipe import Recipe, prepare_recipe
+from station.refusal import BadRequest
 from station.result import Inputs, write_inspection
 from station.verdict import Verdict, judge
 
@@ -24,10 +25,6 @@ NO_CELL = Gates(
     continuity=Gate(holds=True),
     mode=Gate(holds=True),
 )
-
-
-class BadRequest(Exception):
-    """What was asked for cannot be done; the text is one line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

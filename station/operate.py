@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-from drivers.errors import DeviceFault, DriverError
+from drivers.errors import DeviceFault, DriverError, LinkDown
 from drivers.wire.plc import Ctrl, PlcRequest
 from station import alarms as engine
 from station import handshake as shaking
@@ -128,6 +128,7 @@ async def serve_next(cell: Cell) -> None:
     cell.fire(Trigger.ACKED)
     check_fit(cell)
     await warm_worker(cell)
+    await check_devices(cell)
     await watch(cell, lambda: cell.shake.phase is Phase.IDLE)
     cell.fire(Trigger.RELEASED)
 
@@ -234,12 +235,19 @@ async def watch(cell: Cell, holds: Callable[[], bool]) -> None:
 
 
 async def check_devices(cell: Cell) -> None:
-    """Raises a `DriverError` when a device is gone, not homed, or does not run."""
+    """Raises a `DriverError` when a device is gone, not homed, or does not run.
+
+    The scanner's link is opened anew if it is down: an interrupted capture leaves its control channel
+    closed, for its replies carry no id."""
     turntable, scanner = in_place(cell)
     status = await turntable.status()
     if not status.homed:
         raise DeviceFault("turntable", turntable.port, "lost its reference")
-    await scanner.prepare()
+    try:
+        await scanner.prepare()
+    except LinkDown as error:
+        cell.log("info", f"the scanner is connected again: {error}")
+        await cell.connect_scanner()
 
 
 async def jog(cell: Cell) -> None:
@@ -270,8 +278,8 @@ async def abort(cell: Cell, error: Exception) -> None:
     show_status(cell)
     cell.fire(Trigger.SAFE)
     while not cell.leaving:
-        await cell.until(lambda: cell.reset_by is not None or cell.leaving)
-        if cell.reset_by is not None and await cleared(cell):
+        await cell.until(lambda: cell.reset_asked or cell.leaving)
+        if cell.reset_asked and await cleared(cell):
             return
 
 

@@ -82,7 +82,7 @@ def alarm_number(error: BaseException) -> int:
         case WorkerTimeout():
             return 215
         case WorkerFailed():
-            return 136
+            return 216
         case RecordBroken():
             return 3
         case RecordFailed() | OSError():

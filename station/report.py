@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).parent / "templates"
 MAP_HEIGHT_PX = 520
-MAP_POINTS = 400_000
+MAP_POINTS = 250_000
 
 SENTENCES = {
     "PASS": "Serviceable as it is.",
@@ -105,14 +105,18 @@ def plot_of(section: Section, measurement: Measurement, plan: BladePlan) -> Sect
 
 
 def deviation_map(measurement: Measurement, plan: BladePlan) -> Map | None:
-    """The map of the aligned scan, its full colour at the largest limit of profile or form."""
+    """The map of the aligned scan, its full colour at the largest serviceable limit of profile or form."""
     count = len(measurement.aligned_mm)
     if count < 3:
         return None
-    full_mm = max((limit.repairable for limit in form_limits(plan)), default=0.5) or 0.5
-    step = -(-count // MAP_POINTS)
+    full_mm = max((limit.serviceable for limit in form_limits(plan)), default=0.2) or 0.2
+    step, twin = -(-count // MAP_POINTS), measurement.twin_mesh
     views = deviation_views(
-        measurement.aligned_mm[::step], measurement.deviation_mm[::step], full_mm, MAP_HEIGHT_PX
+        measurement.aligned_mm[::step],
+        measurement.deviation_mm[::step],
+        measurement.aligned_mm[:0] if twin is None else twin.vertices_mm,
+        full_mm,
+        MAP_HEIGHT_PX,
     )
     return Map(views=tuple(views), full_mm=full_mm, stops=tuple(legend_stops(full_mm)))
 

@@ -6,6 +6,8 @@ from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
 
+from station.refusal import Refusal
+
 MAX_BYTES = 1_000_000
 UNWRITTEN = ("every", "single", "[key]")  # parts of a location that no file spells
 
@@ -23,7 +25,7 @@ Text = Annotated[str, Strict(), Field(min_length=1, max_length=200), AfterValida
 Port = Annotated[int, Strict(), Field(ge=1, le=65535)]
 
 
-class BadFile(Exception):
+class BadFile(Refusal):
     """A file that people wrote contradicts itself or cannot be read."""
 
     def __init__(self, path: Path, what: str, where: str = "") -> None:

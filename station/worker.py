@@ -85,7 +85,11 @@ class GeometryWorker:
         )
         self._process.start()
         far_end.close()
-        await self._answer(self._pipe, None, timeout_s, _ignore)
+        try:
+            await self._answer(self._pipe, None, timeout_s, _ignore)
+        except WorkerFailed:
+            self.kill()
+            raise
 
     async def begin(self, recipe: int, timeout_s: float) -> None:
         """Turns to a new part."""

@@ -65,7 +65,7 @@ class MessageType(IntEnum):
 # Modbus, 0-based; 64-bit values high word first (docs/wire/scanner.md).
 COMMAND = 0
 COMMAND_COUNT = 65
-SENSOR_STATE = 300
+SENSOR_STATE, STATE_BLOCK_COUNT = 300, 11
 TIME_NOW = 307
 BUFFER_ADVANCE = 976
 STAMP_BLOCK, STAMP_BLOCK_COUNT = 976, 24
@@ -109,6 +109,14 @@ class StampBlock:
 
     frame_index: int
     timestamp_us: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StateBlock:
+    """Registers 300-310: whether the sensor runs, and its clock."""
+
+    running: bool
+    time_us: int
 
 
 @dataclass(slots=True)
@@ -278,11 +286,16 @@ def restamp(raw: bytes, stamp: Stamp) -> bytes:
 
 def decode_stamp_block(registers: list[int]) -> StampBlock:
     """The stamp in registers 976-999."""
-    if len(registers) != STAMP_BLOCK_COUNT:
-        raise _bad(f"{len(registers)} registers of the stamp block, want {STAMP_BLOCK_COUNT}")
-    raw = struct.pack(f">{STAMP_BLOCK_COUNT}H", *registers)
+    raw = _register_bytes(registers, STAMP_BLOCK_COUNT)
     timestamp_us, frame_index = struct.unpack_from(">QQ", raw, 2 * (FRAME_TIME - STAMP_BLOCK))
     return StampBlock(frame_index=frame_index, timestamp_us=timestamp_us)
+
+
+def decode_state_block(registers: list[int]) -> StateBlock:
+    """State and clock in registers 300-310."""
+    raw = _register_bytes(registers, STATE_BLOCK_COUNT)
+    (time_us,) = struct.unpack_from(">Q", raw, 2 * (TIME_NOW - SENSOR_STATE))
+    return StateBlock(running=registers[0] == 1, time_us=time_us)
 
 
 def registers_of(value: int, count: int) -> list[int]:
@@ -353,6 +366,12 @@ def _surface_message(kind: MessageType, attributes: bytes, counts: NDArray[np.in
 
 def _message(kind: MessageType, body: bytes, *, last: bool) -> bytes:
     return _HEAD.pack(_HEAD.size + len(body), kind | (LAST_OF_GROUP if last else 0)) + body
+
+
+def _register_bytes(registers: list[int], count: int) -> bytes:
+    if len(registers) != count or not all(0 <= value <= 0xFFFF for value in registers):
+        raise _bad(f"{len(registers)} registers, want {count} of 16 bits")
+    return struct.pack(f">{count}H", *registers)
 
 
 def _pack_stamp(stamp: Stamp) -> bytes:

@@ -1,7 +1,6 @@
-"""Volumetric cubic B-spline: displacement at points, and the normal equations of a point-to-plane fit.
+"""Volumetric cubic B-spline on a lattice of unit cells, the first at 0.
 
-Points are in lattice units (cell edge 1, first cell at 0). Coefficient k = (c * nb + b) * na + a for lattice
-node (a, b, c) of `counts` = (na, nb, nc); unknown m k + component for a field of m components.
+Lattice node (a, b, c) of `counts` = (na, nb, nc) has the number (c * nb + b) * na + a.
 """
 
 import numpy as np
@@ -21,71 +20,58 @@ def _cubic(t, weights):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _support(point: Floats, counts: Ints, per_axis: Floats, nodes: Ints, weights: Floats) -> None:
-    """Fill the 64 lattice nodes around a point, ascending, and their weights."""
-    cell = np.empty(3, np.int64)
-    for axis in range(3):
-        cell[axis] = min(max(int(np.floor(point[axis])), 0), counts[axis] - 4)
-        _cubic(point[axis] - cell[axis], per_axis[axis])
+def _shape(point: Floats, counts: Ints, per_axis: Floats, weights: Floats) -> int:
+    """Fill the weights of the 64 nodes of the point's cell, ascending; returns the first node's number."""
+    first = 0
+    for axis in range(2, -1, -1):
+        cell = min(max(int(np.floor(point[axis])), 0), counts[axis] - 4)
+        _cubic(point[axis] - cell, per_axis[axis])
+        first = first * counts[axis] + cell
     q = 0
     for c in range(4):
         for b in range(4):
-            row = ((cell[2] + c) * counts[1] + cell[1] + b) * counts[0] + cell[0]
             across = per_axis[2, c] * per_axis[1, b]
             for a in range(4):
-                nodes[q] = row + a
                 weights[q] = across * per_axis[0, a]
                 q += 1
+    return first
+
+
+@njit(cache=True, nogil=True)
+def shapes(points: Floats, counts: Ints) -> tuple[Ints, Floats]:
+    """First node (n,) of each point's cell, and the weights (n, 64) of the cell's nodes, ascending."""
+    first, weights = np.empty(len(points), np.int64), np.empty((len(points), 64))
+    per_axis = np.empty((3, 4))
+    for p in range(len(points)):
+        first[p] = _shape(points[p], counts, per_axis, weights[p])
+    return first, weights
 
 
 @njit(cache=True, nogil=True)
 def evaluate(points: Floats, counts: Ints, coefficients: Floats) -> Floats:
     """The spline (n, m) at points (n, 3) inside the lattice; `coefficients` (nodes, m)."""
     values = np.zeros((len(points), coefficients.shape[1]))
-    per_axis, nodes, weights = np.empty((3, 4)), np.empty(64, np.int64), np.empty(64)
+    per_axis, weights = np.empty((3, 4)), np.empty(64)
     for p in range(len(points)):
-        _support(points[p], counts, per_axis, nodes, weights)
-        for q in range(64):
-            for m in range(coefficients.shape[1]):
-                values[p, m] += weights[q] * coefficients[nodes[q], m]
+        first = _shape(points[p], counts, per_axis, weights)
+        q = 0
+        for c in range(4):
+            for b in range(4):
+                row = first + (c * counts[1] + b) * counts[0]
+                for a in range(4):
+                    for m in range(coefficients.shape[1]):
+                        values[p, m] += weights[q] * coefficients[row + a, m]
+                    q += 1
     return values
 
 
 @njit(cache=True, nogil=True)
-def assemble(
-    points: Floats,
-    directions: Floats,
-    offsets: Floats,
-    weights: Floats,
-    tangential: float,
-    counts: Ints,
-    bands: Floats,
-    right: Floats,
-) -> None:
-    """Add the normal equations of `directions . D(points) = offsets` to `bands` and `right`.
+def add_block(bands: Floats, unknowns: Ints, block: Floats) -> None:
+    """Add a symmetric block (k, k) at ascending `unknowns` (k,) to the lower half kept by columns.
 
-    D has as many components as `directions` (n, m) has columns. `bands` (unknowns, width) holds the lower half
-    by columns: bands[j, i - j] = A[i, j]. Each point also asks for D = 0 in its first three components with the
-    fraction `tangential` of its weight, so that the surface does not slide along itself where nothing holds it.
+    bands[j, i - j] = A[i, j] for i >= j.
     """
-    size = directions.shape[1]
-    per_axis, nodes, shape = np.empty((3, 4)), np.empty(64, np.int64), np.empty(64)
-    metric = np.empty((size, size))
-    for p in range(len(points)):
-        _support(points[p], counts, per_axis, nodes, shape)
-        for a in range(size):
-            for b in range(size):
-                metric[a, b] = weights[p] * directions[p, a] * directions[p, b]
-            if a < 3:
-                metric[a, a] += weights[p] * tangential
-        for i in range(64):
-            for a in range(size):
-                right[size * nodes[i] + a] += weights[p] * shape[i] * offsets[p] * directions[p, a]
-            for j in range(i + 1):
-                both = shape[i] * shape[j]
-                lag = size * (nodes[i] - nodes[j])
-                for b in range(size):
-                    column = bands[size * nodes[j] + b]
-                    for a in range(size):
-                        if lag + a - b >= 0:
-                            column[lag + a - b] += both * metric[a, b]
+    for j in range(len(unknowns)):
+        column = bands[unknowns[j]]
+        for i in range(j, len(unknowns)):
+            column[unknowns[i] - unknowns[j]] += block[i, j]

@@ -54,6 +54,22 @@ def neighbourhood_mean(values: Floats, neighbours: Ints) -> Floats:
 
 
 @njit(cache=True, nogil=True)
+def only_mutual(neighbours: Ints) -> Ints:
+    """The neighbours (n, k) with -1 for each that does not have the point among its own."""
+    mutual = np.full(neighbours.shape, -1, np.int64)
+    for i in range(len(neighbours)):
+        for j in range(neighbours.shape[1]):
+            q = neighbours[i, j]
+            if q < 0:
+                continue
+            for back in neighbours[q]:
+                if back == i:
+                    mutual[i, j] = q
+                    break
+    return mutual
+
+
+@njit(cache=True, nogil=True)
 def component_sizes(neighbours: Ints) -> Ints:
     """Size (n,) of the connected component of each point, edges taken both ways (n, k; -1 none)."""
     count = len(neighbours)

@@ -19,10 +19,11 @@ def blend_quadrics(
 ) -> tuple[Floats, Floats]:
     """Signed distance and distance to the nearest point (mm) at the nodes of a grid, each of `shape`.
 
-    Implicit moving least squares: f(x) = sum w_i q_i(x) / sum w_i, w_i = width_i^2 exp(-|x - p_i|^2 / width_i^2),
-    where q_i is the height of x above the quadric of point i: `frames` (n, 3, 3) holds its two tangents and its
-    normal as rows, `bending` (n, 3) the second derivatives uu, uv, vv. Planes alone would shift a surface of
-    radius R by width^2 / 2R. Nodes farther than `reach_mm` from every point get infinity in both.
+    Implicit moving least squares (Kolluri, 2008): f(x) = sum w_i q_i(x) / sum w_i with the weights
+    w_i = width_i^2 exp(-|x - p_i|^2 / width_i^2), where q_i is the height of x above the quadric of point i:
+    `frames` (n, 3, 3) holds its two tangents and its normal as rows, `bending` (n, 3) the second derivatives
+    uu, uv, vv. Planes alone would shift a surface of radius R by width^2 / 2R. Nodes farther than `reach_mm`
+    from every point get infinity in both.
     """
     weighted = np.zeros(shape)
     weight = np.zeros(shape)

@@ -18,9 +18,9 @@ def _left_of(ax: float, ay: float, bx: float, by: float, px: float, py: float) -
 def column_crossings(
     triangles_mm: Floats, corner_mm: Floats, pitch_mm: float, shape: tuple[int, int]
 ) -> tuple[Ints, Floats]:
-    """Where the columns parallel to z cross the mesh: `start` (columns + 1,) into `height_mm`, ascending in each.
+    """Where columns parallel to z cross the mesh: `start` (columns + 1,) into the heights, ascending in each.
 
-    Column (i, j) stands at `corner_mm` + pitch * (i, j) and has number i * shape[1] + j. A closed mesh gives
+    Column (i, j) stands at corner + pitch * (i, j) and has number i * shape[1] + j. A closed mesh gives
     every column an even number of crossings: enter, leave, enter, leave.
     """
     count = np.zeros(shape[0] * shape[1] + 1, np.int64)

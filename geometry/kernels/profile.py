@@ -10,10 +10,12 @@ from geometry.types import Floats, Ints
 
 @njit(cache=True, nogil=True)
 def _node(nodes_mm: Floats, layer: int, up: float, j: int) -> tuple[float, float]:
-    """Node `j` of the curve that lies the fraction `up` between `layer` and the next one."""
-    a = nodes_mm[layer, j]
-    b = nodes_mm[layer + 1, j]
-    return a[0] + up * (b[0] - a[0]), a[1] + up * (b[1] - a[1])
+    """Node `j` of the curve at the fraction `up` between `layer` and the next one but one: a parabola."""
+    a = (1.0 - up) * (1.0 - 2.0 * up)
+    b = 4.0 * up * (1.0 - up)
+    c = up * (2.0 * up - 1.0)
+    low, middle, high = nodes_mm[layer, j], nodes_mm[layer + 1, j], nodes_mm[layer + 2, j]
+    return a * low[0] + b * middle[0] + c * high[0], a * low[1] + b * middle[1] + c * high[1]
 
 
 @njit(cache=True, nogil=True)
@@ -76,15 +78,16 @@ def project(
 ) -> Floats:
     """(n, 4) of every point: node coordinate in [0, m), signed in-plane distance, outward normal x, y.
 
-    `nodes_mm` (layers, m, 2) are counter-clockwise curves at the heights `z_mm` (layers,), at least two,
-    whose nodes correspond; between two of them a curve is their linear blend. `seeds` (nx, ny, 2) name for
-    each cell a start node and, where the other side of the airfoil may be as near, one there, else -1.
+    `nodes_mm` (2 k + 1, m, 2) are counter-clockwise curves at the heights `z_mm` (2 k + 1,) whose nodes
+    correspond; every odd one lies halfway between its neighbours, and a parabola in height blends the
+    three. `seeds` (nx, ny, 2) name for each cell a start node and, where the other side of the airfoil may
+    be as near, one there, else -1.
     """
     out = np.empty((len(points_mm), 4))
     for i in range(len(points_mm)):
         x, y, z = points_mm[i]
-        layer = min(max(np.searchsorted(z_mm, z, side="right") - 1, 0), len(z_mm) - 2)
-        up = (z - z_mm[layer]) / (z_mm[layer + 1] - z_mm[layer])
+        layer = min(max(np.searchsorted(z_mm, z, side="right") - 1, 0), len(z_mm) - 3) // 2 * 2
+        up = (z - z_mm[layer]) / (z_mm[layer + 2] - z_mm[layer])
         cx = min(max(int((x - corner_mm[0]) / cell_mm), 0), seeds.shape[0] - 1)
         cy = min(max(int((y - corner_mm[1]) / cell_mm), 0), seeds.shape[1] - 1)
         j, best = _descend(nodes_mm, layer, up, x, y, seeds[cx, cy, 0])

@@ -152,6 +152,33 @@ async def test_a_stop_ends_a_move_and_the_move_is_not_repeated() -> None:
         assert not (await turntable.status()).busy
 
 
+async def test_s24_a_driver_switched_off_is_a_device_fault() -> None:
+    async with bench() as it, table(it) as turntable:
+        await turntable.home()
+        it.device.answer(b"/1 1 driver disable", time.monotonic())
+        with pytest.raises(DeviceFault, match=r"driver disabled \(FO\)"):
+            await turntable.move_to(30.0)
+
+
+async def test_s19_a_device_that_is_busy_for_ever_is_a_device_fault() -> None:
+    def busy(line: bytes, reply: bytes | None) -> list[bytes]:
+        text = (reply or b"").rpartition(b":")[0].decode()
+        return [with_lrc(text.replace("IDLE", "BUSY"))]
+
+    async with bench() as it, table(it) as turntable:
+        await turntable.home()
+        it.twist = busy
+        with pytest.raises(DeviceFault, match="still moving after"):
+            await turntable.move_to(3.0)
+
+
+async def test_s11_a_limit_is_a_refusal() -> None:
+    async with bench() as it, table(it) as turntable:
+        await turntable.home()
+        with pytest.raises(Refused, match="BADDATA"):
+            await turntable.move_to(1e6)
+
+
 async def test_s12_stopping_short_is_a_fault() -> None:
     """The device says IDLE three degrees off."""
 

@@ -18,6 +18,7 @@ from drivers.wire.scanner import (
     decode_control_reply,
     decode_group,
     decode_stamp_block,
+    decode_state_block,
     encode_cloud,
     encode_control,
     encode_control_reply,
@@ -195,3 +196,11 @@ def test_the_stamp_block_of_modbus() -> None:
     assert registers_of(65_538, 4) == [0, 0, 1, 2]
     with pytest.raises(BadReply):
         decode_stamp_block(registers[:-1])
+
+
+def test_the_state_block_of_modbus() -> None:
+    state = decode_state_block([1, 0, 0, 0, 0, 0, 0, 0, 0, 0x000F, 0x4240])
+    assert (state.running, state.time_us) == (True, 1_000_000)
+    assert not decode_state_block([0] * 11).running
+    with pytest.raises(BadReply):
+        decode_state_block([0] * 10 + [65_536])

@@ -7,11 +7,12 @@ and lean; what it became in service is a smooth deviation along the normals and 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from geometry.nominal import Nominal, NominalSection
-from geometry.types import Cloud, Floats
+from geometry.types import Cloud, Floats, Ints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +86,16 @@ def section_of(curve: Floats, le: int, z_mm: float) -> NominalSection:
         perimeter_mm=perimeter,
         le_index=le,
         te_index=0,
-        side=np.zeros(len(curve), np.int64),
+        side=_sides(curve, le),
     )
+
+
+def _sides(curve: Floats, le: int, edge_mm: float = 3.0) -> Ints:
+    """0 leading edge, 1 suction (above the camber line), 2 trailing edge, 3 pressure side."""
+    side = np.where(np.arange(len(curve)) <= le, 1, 3)
+    side[np.linalg.norm(curve - curve[0], axis=1) <= edge_mm] = 2
+    side[np.linalg.norm(curve - curve[le], axis=1) <= edge_mm] = 0
+    return side
 
 
 Deviation = Callable[[Floats, Floats], Floats]  # fraction of the perimeter, z -> mm along the normal
@@ -140,16 +149,12 @@ class Part:
         self, rng: np.random.Generator, low_mm: float, high_mm: float, spacing_mm: float, noise_mm: float
     ) -> Floats:
         """Random points (n, 3), one per spacing_mm^2, noise N(0, noise_mm) along random directions."""
-        grid = np.linspace(low_mm, high_mm, 25)
-        curves = [self.blade.section(float(z))[0] for z in grid]
-        arcs = [arc_of(curve) for curve in curves]
-        count = rng.poisson((high_mm - low_mm) * arcs[0][1] / spacing_mm**2)
+        grid, table, perimeter_mm = _tables(self.blade, low_mm, high_mm)
+        count = rng.poisson((high_mm - low_mm) * perimeter_mm / spacing_mm**2)
         z = rng.uniform(low_mm, high_mm, count)
         s = rng.random(count)
         layer = np.clip(np.searchsorted(grid, z) - 1, 0, len(grid) - 2)
         up = (z - grid[layer]) / (grid[1] - grid[0])
-        fine = np.linspace(0.0, 1.0, 20001)
-        table = np.stack([_table(c, a, fine) for c, a in zip(curves, arcs, strict=True)])
         at = s * 20000
         i = at.astype(np.int64)
         f = (at - i)[:, None]
@@ -161,6 +166,15 @@ class Part:
         direction = rng.normal(size=points.shape)
         direction /= np.linalg.norm(direction, axis=1)[:, None]
         return points + direction * rng.normal(0.0, noise_mm, count)[:, None]
+
+
+@cache
+def _tables(blade: Blade, low_mm: float, high_mm: float) -> tuple[Floats, Floats, float]:
+    """Heights (25,), curve and normals (25, 20001, 4) at even fractions of the perimeter, first perimeter."""
+    grid = np.linspace(low_mm, high_mm, 25)
+    curves = [blade.section(float(z))[0] for z in grid]
+    fine = np.linspace(0.0, 1.0, 20001)
+    return grid, np.stack([_table(c, arc_of(c), fine) for c in curves]), arc_of(curves[0])[1]
 
 
 def _table(curve: Floats, arc: tuple[Floats, float], fine: Floats) -> Floats:

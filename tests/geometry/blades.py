@@ -87,14 +87,12 @@ class Scan:
 
 def scan(blade: Blade, per_mm2: float, rng: np.random.Generator, *, tip_face: bool = True) -> Scan:
     """Points even over the exact surface, by default with its tip face."""
-    t, z = rng.uniform(0, 2 * np.pi, 200_000), rng.uniform(0, blade.height_mm, 200_000)
+    densest = 1.3 * blade.normal(np.full(2, np.pi / 2), np.zeros(2))[1][0]  # mm2 for each unit of t and z
+    drawn = int(per_mm2 * densest * 2 * np.pi * blade.height_mm)
+    t, z = rng.uniform(0, 2 * np.pi, drawn), rng.uniform(0, blade.height_mm, drawn)
     normals, density = blade.normal(t, z)
-    wanted = int(per_mm2 * density.mean() * 2 * np.pi * blade.height_mm)
-    chosen = rng.choice(len(t), wanted, p=density / density.sum())
-    jitter = rng.normal(scale=1e-3, size=(2, wanted))  # points drawn twice are apart
-    t, z = t[chosen] + jitter[0], np.clip(z[chosen] + jitter[1], 0.0, blade.height_mm)
-    normals, _ = blade.normal(t, z)
-    points = blade.point(t, z)
+    kept = rng.uniform(0, densest, drawn) < density
+    points, normals = blade.point(t[kept], z[kept]), normals[kept]
     if tip_face:
         lid = _lid(blade, per_mm2, rng, lambda points: np.full(len(points), blade.height_mm))
         points, normals = np.concatenate([points, lid]), np.concatenate([normals, _up(len(lid))])

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from geometry.damage import Damage, DamageKind
 from geometry.register import Alignment
-from geometry.types import Cloud, Measurand, Mesh, NotMeasured, Zone
 from geometry.twin import Twin
+from geometry.types import Cloud, Measurand, Mesh, NotMeasured, Zone
 
 Array = NDArray[np.float64]
 
@@ -265,8 +265,8 @@ def specimen(
     whole = solid_of(mesh).as_original()
     rest, removed = whole, []
     marks = {whole.original_id(): -1}
-    for number, cutter in enumerate(cutters.values()):
-        cutter = cutter.as_original()
+    for number, tool in enumerate(cutters.values()):
+        cutter = tool.as_original()
         marks[cutter.original_id()] = number
         removed.append(float((rest ^ cutter).volume()))
         rest = rest - cutter

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from geometry.kernels.graph import component_sizes, dilate, grow, neighbourhood_mean
+from geometry.kernels.graph import component_sizes, dilate, grow, neighbourhood_mean, only_mutual
 
 
 def random_graph(seed, count=200, k=3):
@@ -39,6 +39,12 @@ def test_mean_counts_the_point_and_its_real_neighbours():
     values = rng.normal(size=200)
     slow = [np.mean([values[i], *(values[q] for q in neighbours[i] if q >= 0)]) for i in range(200)]
     assert np.allclose(neighbourhood_mean(values, neighbours), slow)
+
+
+def test_mutual_neighbours_name_each_other():
+    neighbours, _ = random_graph(5, count=40, k=6)
+    slow = [[q if q >= 0 and i in neighbours[q] else -1 for q in row] for i, row in enumerate(neighbours)]
+    assert only_mutual(neighbours).tolist() == slow
 
 
 def test_component_sizes_match_scipy():

@@ -1,11 +1,11 @@
 """Closest points on triangles against a slow, obvious projection."""
 
-import blades
 import numpy as np
 import pytest
 
 from geometry.kernels.triangle import closest_on_triangles, describe_feet, refine_closest
 from geometry.solid import faces_around, solid_normals
+from tests.geometry import blades
 
 
 def slow_foot(point, triangle):

@@ -28,8 +28,8 @@ def slow_quadric(points, i, neighbours, normal):
 def test_curvature_of_a_sphere():
     points = sphere(20_000, 10.0, np.random.default_rng(1))
     shape = local_shape(points)
-    assert np.nanmedian(shape.gaussian_per_mm2) == pytest.approx(0.01, rel=1e-3)
-    assert np.nanmedian(np.abs(shape.mean_per_mm)) == pytest.approx(0.1, rel=1e-3)
+    assert np.nanmedian(shape.gaussian_per_mm2) == pytest.approx(0.01, rel=5e-3)
+    assert np.nanmedian(np.abs(shape.mean_per_mm)) == pytest.approx(0.1, rel=5e-3)
     assert np.nanmin(np.abs(np.einsum("nj,nj->n", shape.normals, points)) / 10.0) > 1.0 - 1e-6
     assert np.nanmax(np.abs(shape.offset_mm)) < 1e-4
 
@@ -50,7 +50,9 @@ def test_the_kernel_fits_what_a_plain_least_squares_fits():
     for i in range(0, 300, 17):
         near = points[nearest[i, :16]]
         normal = np.linalg.svd(near - near.mean(axis=0))[2][2]
-        gaussian, tilted, offset = slow_quadric(points, i, shape.neighbours[i][shape.neighbours[i] >= 0], normal)
+        gaussian, tilted, offset = slow_quadric(
+            points, i, shape.neighbours[i][shape.neighbours[i] >= 0], normal
+        )
         sign = np.sign(tilted @ shape.normals[i])
         assert shape.gaussian_per_mm2[i] == pytest.approx(gaussian, rel=1e-6, abs=1e-9)
         assert np.abs(sign * tilted - shape.normals[i]).max() < 1e-8

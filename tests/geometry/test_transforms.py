@@ -27,7 +27,9 @@ def test_log_takes_exp_back(seed):
 def test_the_rotation_of_exp_is_the_matrix_exponential(seed):
     twist, pivot = random_twist(seed)
     x, y, z = twist[:3]
-    assert np.allclose(exp(twist, pivot)[:3, :3], expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])), atol=1e-12)
+    assert np.allclose(
+        exp(twist, pivot)[:3, :3], expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])), atol=1e-12
+    )
 
 
 @given(seeds)

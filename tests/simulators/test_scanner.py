@@ -159,10 +159,15 @@ async def test_one_trigger_gives_one_group_to_every_client_and_moves_the_index_b
         assert int.from_bytes(struct.pack(">4H", *stamp), "big") == first.timestamp_us  # type: ignore[misc]
 
 
-async def test_a_trigger_during_an_exposure_is_refused() -> None:
-    device = ScannerDevice(running=True, exposing=True)
-    async with served(device=device) as stranger:
-        assert (await stranger.control(TRIGGER))[1] == Status.INVALID_STATE
+async def test_every_accepted_trigger_gives_its_group_even_in_a_burst() -> None:
+    async with served() as stranger, listening(stranger) as frame:
+        await stranger.control(START)
+        answers = await stranger.control_frames([encode_control(TRIGGER)] * 5)
+        assert [status for _, status, _ in answers] == [1] * 5
+        frames = [await frame() for _ in range(5)]
+        assert [f.frame_index for f in frames] == [1, 2, 3, 4, 5]
+        assert sorted({f.timestamp_us for f in frames}) == [f.timestamp_us for f in frames]
+        assert await stranger.index() == 5
 
 
 async def test_an_exposure_that_fails_sends_nothing_and_the_next_works(
@@ -177,7 +182,7 @@ async def test_an_exposure_that_fails_sends_nothing_and_the_next_works(
     async with served(expose) as stranger, listening(stranger) as frame:
         await stranger.control(START)
         await stranger.control(TRIGGER)
-        while stranger.device.exposing:
+        while stranger.device.pending:
             await asyncio.sleep(0)
         assert await stranger.index() == 0
         await stranger.control(TRIGGER)
@@ -253,6 +258,6 @@ def test_index_and_time_only_ever_go_up(frames: list[tuple[bool, float]]) -> Non
 def test_a_lost_trigger_is_accepted_and_forgotten() -> None:
     device = ScannerDevice(running=True, lose_triggers=1)
     assert device.trigger() is Status.OK
-    assert not device.exposing
+    assert device.pending == 0
     assert device.trigger() is Status.OK
-    assert device.exposing
+    assert device.pending == 1

@@ -147,6 +147,8 @@ def patch(index: int = 0, *, watertight: bool = True, volume_mm3: float = 60.0) 
         volume_mm3=number("volume_mm3", volume_mm3, 0.2),
         volume_check_mm3=volume_mm3,
         broken_gap_mm=0.3,
+        border_step_mm=number("border_step_mm", 0.02),
+        border_angle_deg=NotMeasured(reason="the border is too short"),
     )
 
 

@@ -1,0 +1,42 @@
+"""The damage mask on a plate whose damage is known."""
+
+import numpy as np
+import pytest
+
+from geometry.errors import BadInput
+from geometry.kernels.neighbours import k_nearest
+from geometry.mask import MaskSettings, damaged, robust_sigma
+
+
+def plate(rng, sigma_mm):
+    """Points of a 20 mm plate, their noisy residuals and the depth of a pit of 3 mm radius in its middle."""
+    points = np.column_stack([rng.uniform(-10, 10, (8000, 2)), np.zeros(8000)])
+    depth = 0.3 * np.maximum(0.0, 1.0 - np.hypot(*points[:, :2].T) / 3.0)
+    return points, rng.normal(scale=sigma_mm, size=8000) - depth, depth
+
+
+def test_robust_sigma_is_the_sigma_and_ignores_outliers():
+    values = np.random.default_rng(1).normal(3.0, 0.5, 20_000)
+    assert robust_sigma(values) == pytest.approx(0.5, rel=0.02)
+    assert robust_sigma(np.concatenate([values, np.full(1000, 1e6)])) == pytest.approx(0.53, rel=0.05)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.015, 0.03])
+def test_damage_deeper_than_three_sigma_is_found_and_little_else(sigma):
+    points, residual, depth = plate(np.random.default_rng(2), sigma)
+    flags = damaged(residual, k_nearest(points, 17)[0], max(sigma, 1e-4) / 4.0, MaskSettings())
+    assert flags[depth > 3.0 * max(sigma, 0.001)].mean() > 0.99
+    assert flags[np.hypot(*points[:, :2].T) > 4.0].mean() < 0.005
+
+
+def test_excess_counts_as_much_as_missing():
+    points, residual, _ = plate(np.random.default_rng(3), 0.015)
+    neighbours, _ = k_nearest(points, 17)
+    up, down = (damaged(r, neighbours, 0.004, MaskSettings()) for r in (residual, -residual))
+    assert np.array_equal(up, down)
+
+
+@pytest.mark.parametrize("wrong", [{"low": 6.0}, {"low": 0.0}, {"neighbours": 2}])
+def test_settings_that_contradict_themselves_are_refused(wrong):
+    with pytest.raises(BadInput, match="mask"):
+        MaskSettings(**wrong)
