@@ -95,7 +95,7 @@ def tukey(distance_mm: Floats, used: Bools, width: float) -> Floats:
 
 
 def fit_kept(
-    points_mm: Floats, start: Fit, kept: Bools, nominal: Nominal, *, steps: int = 6, close_mm: float = 1e-5
+    points_mm: Floats, start: Fit, kept: Bools, nominal: Nominal, *, steps: int = 15, close_mm: float = 2e-5
 ) -> Fit:
     """The pose by plain least squares over the `kept` points (n,)."""
     T, found, weak = start.T_nominal_scan, start.found, start.weak

@@ -59,39 +59,52 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
     place = np.column_stack([points_mm, TURN_MM * normals])
     limit_mm = max(settings.form_mm, 4.0 * robust_sigma(distance_mm))
     near = np.flatnonzero(np.abs(distance_mm) <= limit_mm)
-    if len(near) < settings.form_window:
+    if len(near) < settings.form_window:  # nothing of the nominal's form is left to tell
         return np.zeros(len(points_mm))
     chosen = near[:: max(1, len(near) // settings.form_points)]
     nodes = chosen[:: max(1, len(chosen) // settings.form_nodes)]
-    coefficients = _local_fits(place[nodes], place[chosen], distance_mm[chosen], settings.form_window)
-    return _blend(place, place[nodes], coefficients)
+    nearest = cKDTree(place[chosen])
+    _, members = nearest.query(place[nodes], k=settings.form_window)
+    fits = _local_fits(
+        points_mm[nodes], points_mm[chosen][members], normals[chosen][members], distance_mm[chosen][members]
+    )
+    return _blend(place, place[nodes], normals, fits)
 
 
-def _local_fits(nodes: Floats, place: Floats, distance_mm: Floats, window: int) -> Floats:
-    """Value and gradient (m, 4) at each node (m, 6): weighted least squares with Tukey's weights."""
-    apart, members = cKDTree(place).query(nodes, k=window)
-    closeness = np.exp(-4.5 * (apart / apart[:, -1:]) ** 2)  # the last member at three sigmas
-    offset_mm = place[members][:, :, :3] - nodes[:, None, :3]
-    design = np.concatenate([np.ones((*members.shape, 1)), offset_mm], axis=2)
-    values = distance_mm[members]
-    ridge = np.diag([1e-9, *np.full(3, 1e-3)]) * window  # across the surface the gradient is unknown
+def _smooth_motions(offset_mm: Floats, normals: Floats) -> Floats:
+    """What shifts, turns, thickening and its slope move points (m, k) along their normals: (m, k, 10)."""
+    ones = np.ones((*offset_mm.shape[:2], 1))
+    return np.concatenate([normals, np.cross(offset_mm, normals), ones, offset_mm], axis=2)
+
+
+def _local_fits(nodes_mm: Floats, points_mm: Floats, normals: Floats, distance_mm: Floats) -> Floats:
+    """The smooth motion (m, 10) round each node: weighted least squares over its k members, Tukey's weights.
+
+    A shift explains both sides of an edge at once, where the distance itself jumps from one to the other.
+    """
+    offset_mm = points_mm - nodes_mm[:, None]
+    apart = np.linalg.norm(offset_mm, axis=2)
+    closeness = np.exp(-4.5 * (apart / apart.max(axis=1, keepdims=True)) ** 2)  # the last at three sigmas
+    design = _smooth_motions(offset_mm, normals)
+    ridge = 1e-3 * points_mm.shape[1] * np.eye(design.shape[2])  # flat surfaces do not tell all of them
     weights = closeness
     for _ in range(IRLS_STEPS):
         weighted = design * weights[:, :, None]
         normal_matrix = np.einsum("mki,mkj->mij", weighted, design) + ridge
-        right = np.einsum("mki,mk->mi", weighted, values)
-        coefficients = np.linalg.solve(normal_matrix, right[:, :, None])[:, :, 0]
-        residual = values - np.einsum("mki,mi->mk", design, coefficients)
+        right = np.einsum("mki,mk->mi", weighted, distance_mm)
+        motions = np.linalg.solve(normal_matrix, right[:, :, None])[:, :, 0]
+        residual = distance_mm - np.einsum("mki,mi->mk", design, motions)
         scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=1, keepdims=True), 1e-6)
         weights = closeness * np.maximum(1.0 - (residual / (4.685 * scale)) ** 2, 0.0) ** 2
-    return np.asarray(coefficients)
+    return np.asarray(motions)
 
 
-def _blend(place: Floats, nodes: Floats, coefficients: Floats) -> Floats:
+def _blend(place: Floats, nodes: Floats, normals: Floats, fits: Floats) -> Floats:
     """The local fits at each point (n,), weighted by closeness over the nearest nodes."""
-    apart, nearest = cKDTree(nodes).query(place, k=min(BLENDED, len(nodes)))
+    apart, nearest = cKDTree(nodes).query(place, k=BLENDED)
     weights = np.maximum(1.0 - (apart / (1.05 * apart[:, -1:] + 1e-9)) ** 2, 0.0) ** 2
-    offset_mm = place[:, None, :3] - nodes[nearest][:, :, :3]
-    fits = coefficients[nearest]
-    values = fits[:, :, 0] + np.einsum("nki,nki->nk", offset_mm, fits[:, :, 1:])
-    return np.asarray((weights * values).sum(axis=1) / weights.sum(axis=1))
+    values = np.zeros(len(place))
+    for j in range(BLENDED):
+        motions = _smooth_motions((place[:, :3] - nodes[nearest[:, j], :3])[:, None], normals[:, None])[:, 0]
+        values += weights[:, j] * np.einsum("ni,ni->n", motions, fits[nearest[:, j]])
+    return np.asarray(values / weights.sum(axis=1))

@@ -352,7 +352,7 @@ def _border(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> tuple[Measured, 
         unseen = NotMeasured(reason=f"{len(rim.points_mm)} scan points on the sound skin round the patch")
         return unseen, unseen
     at_mm = mesh.vertices_mm[np.intersect1d(mesh.faces[outer], mesh.faces[~outer])]
-    _, index = cKDTree(rim.feet_mm).query(at_mm, BORDER_POINTS)
+    _, index = cKDTree(rim.feet_mm).query(at_mm, np.arange(1, BORDER_POINTS + 1))
     height = ((rim.points_mm - rim.feet_mm) * rim.normals).sum(axis=1)[index]
     across = frames_along(rim.normals[index[:, 0]])[:, :2]
     off = np.einsum("nij,nkj->nki", across, rim.feet_mm[index] - at_mm[:, None])

@@ -18,6 +18,7 @@ from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh
 CREASE_COSINE = 0.94  # corner normals that differ more belong to different sides of an edge
 PATCH_CELLS = 0.4  # what the lattice cannot follow is alike over this part of a cell
 FIRST_STIFFNESS = 1e4  # of the free form, before the data set it
+LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
 NO_NOISE_MM = 1e-5  # least scatter believed
 
 
@@ -251,15 +252,16 @@ def _fit_smooth(
     before_mm = np.zeros(len(ground.nodes.points_mm))
     field: Freeform | None = None
     for rounds in range(1, settings.rounds + 1):
-        field = _smooth_round(found, sound, field, stiffness, ground, settings)
+        loose_mm = settings.damage_mm * max(1, LOOSE_ROUNDS + 1 - rounds)
+        field = _smooth_round(found, sound, field, stiffness, loose_mm, ground, settings)
         stiffness = field.stiffness
         after_mm = field.along(ground.nodes.points_mm, ground.nodes.normals)
         settled = bool(np.abs(after_mm - before_mm).max() <= 0.1 * settings.damage_mm)
-        if settled and rounds > 2:
+        if settled and rounds > LOOSE_ROUNDS:
             return field, rounds, True
         before_mm = after_mm
         found = _compare(points_mm, field, ground, found)
-        sound = _screen(found, found.usable, ground, settings.damage_mm)
+        sound = _screen(found, found.usable, ground, loose_mm)
     if field is None:
         raise CannotFitTwin("no round was allowed")
     return field, settings.rounds, False
@@ -270,6 +272,7 @@ def _smooth_round(
     sound: Bools,
     field: Freeform | None,
     stiffness: Floats,
+    loose_mm: float,
     ground: _Ground,
     settings: TwinSettings,
 ) -> Freeform:
@@ -284,7 +287,7 @@ def _smooth_round(
     if field is not None:
         expected_mm = max(expected_mm, float(np.sqrt(misfit_mm2)))
     weights = 1.0 / (share_mm2 + ground.patch_nodes * expected_mm**2)
-    weights *= _tukey(residual, np.sqrt(misfit_mm2 + share_mm2)) * held
+    weights *= _tukey(residual, np.sqrt(misfit_mm2 + share_mm2 + (0.5 * loose_mm) ** 2)) * held
     return fit_freeform(
         ground.lattice,
         votes.centre_mm[held],

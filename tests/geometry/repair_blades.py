@@ -4,7 +4,7 @@ The section is a shape-function airfoil over a parabolic camber line, twisted an
 Nothing here uses the product but its plain data types.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb, pi, radians
 
 import manifold3d
@@ -313,6 +313,20 @@ def _sampled(mesh: Mesh, per_mm2: float, rng: np.random.Generator) -> tuple[Arra
     u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
     points = a[face] + u[:, None] * (b - a)[face] + v[:, None] * (c - a)[face]
     return points, cross[face] / twice[face][:, None], face
+
+
+def without(scanned: Specimen, gone: NDArray[np.bool_]) -> Specimen:
+    """The same specimen, but the scan lacks some points."""
+    kept, number = ~gone, np.cumsum(~gone) - 1
+    cloud, damages = scanned.cloud, scanned.damages
+    return replace(
+        scanned,
+        cloud=Cloud(
+            points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept]
+        ),
+        damages=tuple(replace(d, points=number[d.points[kept[d.points]]]) for d in damages),
+        on_break=scanned.on_break[kept],
+    )
 
 
 def damage_at(
