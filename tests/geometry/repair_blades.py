@@ -58,9 +58,9 @@ def blade_mesh(pitch_mm: float = 0.35) -> Mesh:
     cap = (
         mapbox_earcut.triangulate_float64(flat, np.array([around], np.uint32)).reshape(-1, 3).astype(np.int64)
     )
-    corner = flat[cap]
-    turn = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    cap[turn < 0.0] = cap[turn < 0.0][:, ::-1]
+    (ax, ay), (bx, by) = (np.moveaxis(flat[cap][:, i] - flat[cap][:, 0], 1, 0) for i in (1, 2))
+    clockwise = ax * by - ay * bx < 0.0
+    cap[clockwise] = cap[clockwise][:, ::-1]
     faces = np.concatenate([side, cap[:, ::-1], cap + (len(z) - 1) * around])
     return Mesh(vertices_mm=np.concatenate(rings), faces=faces)
 
