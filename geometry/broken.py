@@ -83,6 +83,12 @@ class Rim:
     feet_mm: Floats  # (r, 3) on the twin
     normals: Floats  # (r, 3) of the twin there
 
+    def clear_of(self, break_mm: Floats, least_mm: float) -> tuple[Floats, Floats, Floats]:
+        """Feet, normals and heights above the twin of the points at least so far from the break."""
+        clear = cKDTree(break_mm).query(self.points_mm)[0] >= least_mm
+        height_mm = ((self.points_mm - self.feet_mm) * self.normals).sum(axis=1)
+        return self.feet_mm[clear], self.normals[clear], height_mm[clear]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BrokenSurface:
@@ -132,7 +138,7 @@ def find_broken_surface(
     lost_mm, lost_normals = _lost_skin(skin, raw_mm, sound_mm, lost_pitch_mm, support_mm)
     inward = _outward_sign(points_mm, frames[:, 2], _towards(points_mm, lost_mm, lost_normals)) < 0.0
     frames[inward, 1:] *= -1.0
-    bending[np.ix_(inward, [0, 2])] *= -1.0
+    bending[np.ix_(inward, np.array([0, 2]))] *= -1.0
     return BrokenSurface(
         raw_mm=raw_mm,
         sigma_mm=sigma_mm,

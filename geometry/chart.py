@@ -220,7 +220,7 @@ def _seeds(curve_mm: Floats) -> tuple[Ints, Floats, float]:
 
     Near: within what a cell and the twist of the band can hide.
     """
-    cell, margin, doubt = 0.5, 2.0, 3.0
+    cell, margin, doubt = 1.0, 2.0, 3.5
     corner = curve_mm.min(axis=0) - margin
     count = np.ceil((curve_mm.max(axis=0) + margin - corner) / cell).astype(np.int64)
     at = corner + cell * (np.indices(tuple(count)).reshape(2, -1).T + 0.5)

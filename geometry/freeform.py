@@ -14,7 +14,9 @@ from geometry.types import Floats, Ints
 COMPONENTS = 4  # three of the shift of space, one of the swelling along the surface normal
 SKIRT_CELLS = 0.1  # a cell this near to surface bends, too
 MARGIN_CELLS = 0.5  # of the lattice beyond the points it was laid over
-LEAST_ROUGH = 0.44  # mean second derivative of a wave eight cells long: (2 pi / 8)^2 / sqrt(2) amplitudes per cell^2
+LEAST_ROUGH = (
+    0.44  # mean second derivative of a wave eight cells long: (2 pi / 8)^2 / sqrt(2) amplitudes per cell^2
+)
 FADE_CELLS = 3.0  # beyond the lattice the displacement dies out over this distance
 
 
@@ -38,7 +40,8 @@ class Lattice:
         return int(self.unknown.max()) + 1
 
     def local(self, points_mm: Floats) -> tuple[Floats, Floats]:
-        """The nearest points (n, 3) of the lattice's domain, in cells, and how far beyond it they were (n,)."""
+        """The nearest points (n, 3) of the lattice's domain, in cells, and how far beyond it they were
+        (n,)."""
         return _local(points_mm, self.axes, self.origin_mm, self.cell_mm, self.counts)
 
     def directions(self, normals: Floats) -> Floats:
@@ -47,7 +50,8 @@ class Lattice:
 
 
 def swell(normals: Floats) -> Floats:
-    """How much of the swelling each unit normal (n, 3) feels: an airfoil thickens in its sections, not along z."""
+    """How much of the swelling each unit normal (n, 3) feels: an airfoil thickens in its sections, not
+    along z."""
     return np.asarray(1.0 - normals[:, 2] ** 2)
 
 
@@ -112,14 +116,17 @@ class Freeform:
         """Posterior draws (n, count) of the error along `normals`; beyond the lattice they grow instead."""
         inside, beyond = self.lattice.local(points_mm)
         errors = np.zeros((len(self.coefficients), COMPONENTS * count))
-        errors[self.lattice.unknown >= 0] = _posterior(self.factor, rng, count).reshape(-1, COMPONENTS * count)
+        errors[self.lattice.unknown >= 0] = _posterior(self.factor, rng, count).reshape(
+            -1, COMPONENTS * count
+        )
         spread = evaluate(inside, self.lattice.counts, errors).reshape(-1, COMPONENTS, count)
         along = np.einsum("nd,ndc->nc", self.lattice.directions(normals), spread)
         return np.asarray(along * (1.0 + beyond[:, None]) ** 2)
 
 
 def _posterior(factor: Floats, rng: np.random.Generator, count: int) -> Floats:
-    """Draws (unknowns, count) from the zero-mean Gaussian whose inverse covariance has this Cholesky factor."""
+    """Draws (unknowns, count) from the zero-mean Gaussian whose inverse covariance has this Cholesky
+    factor."""
     noise = rng.standard_normal((factor.shape[1], count))
     draws, info = dtbtrs(factor, noise, uplo="L", trans="T")
     if info != 0:
@@ -155,7 +162,8 @@ def fit_freeform(
     slide: float,
     form_mm: float,
 ) -> Freeform:
-    """The most probable deformation that moves surface points (n, 3) by `offsets_mm` (n,) along their normals.
+    """The most probable deformation that moves surface points (n, 3) by `offsets_mm` (n,) along their
+    normals.
 
     `weights` (n,) are inverse variances. The prior's inverse variance is `stiffness` (COMPONENTS,) times the
     integral of the squared second derivatives; that of the returned field is updated by the degrees of
@@ -211,10 +219,9 @@ def _factor(bands: Floats) -> Floats:
         raise CannotFitTwin(f"free-form equations are singular: {error}") from error
 
 
-def _updated(
-    lattice: Lattice, factor: Floats, solution: Floats, stiffness: Floats, form_mm: float
-) -> Floats:
-    """Degrees of freedom that the data determine over the energy in them, for the shift and for the swelling."""
+def _updated(lattice: Lattice, factor: Floats, solution: Floats, stiffness: Floats, form_mm: float) -> Floats:
+    """Degrees of freedom that the data determine over the energy in them, for the shift and for the
+    swelling."""
     draws = 24
     errors = _posterior(factor, np.random.default_rng(lattice.free), draws)
     open_energy = _energies(lattice, errors).mean(axis=1)

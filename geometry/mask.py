@@ -11,7 +11,7 @@ from geometry.types import Bools, Floats, Ints
 
 TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
 BLENDED = 6  # nodes around a point whose local fits are blended there
-IRLS_STEPS = 5
+IRLS_STEPS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,8 +21,8 @@ class MaskSettings:
     low: float = 2.5  # damaged if joined to what certainly is
     form_mm: float = 0.15  # smooth deviations up to this are form, not damage
     form_points: int = 15_000  # of the cloud, to find them
-    form_nodes: int = 1500  # local fits
-    form_window: int = 200  # points in each
+    form_nodes: int = 1000  # local fits
+    form_window: int = 160  # points in each
 
     def __post_init__(self) -> None:
         if not (self.neighbours >= 4 and 0.0 < self.low <= self.high and self.form_mm > 0.0):
@@ -63,12 +63,16 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
         return np.zeros(len(points_mm))
     chosen = near[:: max(1, len(near) // settings.form_points)]
     nodes = chosen[:: max(1, len(chosen) // settings.form_nodes)]
-    nearest = cKDTree(place[chosen])
-    _, members = nearest.query(place[nodes], k=settings.form_window)
+    _, members = _nearest(place[chosen], place[nodes], settings.form_window)
     fits = _local_fits(
         points_mm[nodes], points_mm[chosen][members], normals[chosen][members], distance_mm[chosen][members]
     )
     return _blend(place, place[nodes], normals, fits)
+
+
+def _nearest(targets: Floats, places: Floats, k: int) -> tuple[Floats, Ints]:
+    apart, nearest = cKDTree(targets).query(places, k=k)
+    return np.asarray(apart, np.float64), np.asarray(nearest, np.int64)
 
 
 def _smooth_motions(offset_mm: Floats, normals: Floats) -> Floats:
@@ -89,19 +93,17 @@ def _local_fits(nodes_mm: Floats, points_mm: Floats, normals: Floats, distance_m
     ridge = 1e-3 * points_mm.shape[1] * np.eye(design.shape[2])  # flat surfaces do not tell all of them
     weights = closeness
     for _ in range(IRLS_STEPS):
-        weighted = design * weights[:, :, None]
-        normal_matrix = np.einsum("mki,mkj->mij", weighted, design) + ridge
-        right = np.einsum("mki,mk->mi", weighted, distance_mm)
-        motions = np.linalg.solve(normal_matrix, right[:, :, None])[:, :, 0]
-        residual = distance_mm - np.einsum("mki,mi->mk", design, motions)
+        weighted = np.swapaxes(design * weights[:, :, None], 1, 2)
+        motions = np.linalg.solve(weighted @ design + ridge, weighted @ distance_mm[:, :, None])
+        residual = distance_mm - (design @ motions)[:, :, 0]
         scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=1, keepdims=True), 1e-6)
         weights = closeness * np.maximum(1.0 - (residual / (4.685 * scale)) ** 2, 0.0) ** 2
-    return np.asarray(motions)
+    return np.asarray(motions[:, :, 0])
 
 
 def _blend(place: Floats, nodes: Floats, normals: Floats, fits: Floats) -> Floats:
     """The local fits at each point (n,), weighted by closeness over the nearest nodes."""
-    apart, nearest = cKDTree(nodes).query(place, k=BLENDED)
+    apart, nearest = _nearest(nodes, place, BLENDED)
     weights = np.maximum(1.0 - (apart / (1.05 * apart[:, -1:] + 1e-9)) ** 2, 0.0) ** 2
     values = np.zeros(len(place))
     for j in range(BLENDED):

@@ -1,6 +1,6 @@
 """A scalar field on a surface, offset along its normal: a thin plate that decays where nothing is seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -32,9 +32,21 @@ class Nodes:
         low_mm = self.points_mm.min(axis=0)
         at = ((self.points_mm - low_mm) / edge_mm).astype(np.int64)
         cells = at.max(axis=0) + 1
-        starts, order = counting_sort((at[:, 0] * cells[1] + at[:, 1]) * cells[2] + at[:, 2], int(cells.prod()))
+        starts, order = counting_sort(
+            (at[:, 0] * cells[1] + at[:, 1]) * cells[2] + at[:, 2], int(cells.prod())
+        )
         return within(
-            points_mm, normals, self.points_mm, self.normals, order, starts, low_mm, cells, self.spacing_mm, reach, width
+            points_mm,
+            normals,
+            self.points_mm,
+            self.normals,
+            order,
+            starts,
+            low_mm,
+            cells,
+            self.spacing_mm,
+            reach,
+            width,
         )
 
     def interpolation(self, points_mm: Floats, normals: Floats) -> sp.csr_array:
@@ -53,7 +65,9 @@ class Nodes:
 
     def graph(self) -> Ints:
         """The neighbours (n, 9; -1 none) of each node."""
-        return np.ascontiguousarray(self.near(self.points_mm, self.normals, INTERPOLATION_REACH, 10)[0][:, 1:])
+        return np.ascontiguousarray(
+            self.near(self.points_mm, self.normals, INTERPOLATION_REACH, 10)[0][:, 1:]
+        )
 
 
 def _rows(found: Ints, values: Floats, columns: int) -> sp.csr_array:
@@ -69,11 +83,14 @@ def scatter_nodes(points_mm: Floats, normals: Floats, each_mm2: float, spacing_m
     cells = (np.ptp(points_mm, axis=0) / spacing_mm).astype(np.int64) + 1
     kept = thin(points_mm, normals, spacing_mm, low_mm, cells)
     nodes = Nodes(
-        points_mm=points_mm[kept], normals=normals[kept], area_mm2=np.ones(int(kept.sum())), spacing_mm=spacing_mm
+        points_mm=points_mm[kept],
+        normals=normals[kept],
+        area_mm2=np.ones(int(kept.sum())),
+        spacing_mm=spacing_mm,
     )
     owner = nodes.owner(points_mm, normals)
-    area_mm2 = each_mm2 * np.bincount(owner[owner >= 0], minlength=len(nodes.points_mm))
-    return Nodes(points_mm=nodes.points_mm, normals=nodes.normals, area_mm2=area_mm2, spacing_mm=spacing_mm)
+    votes = np.bincount(owner[owner >= 0], minlength=len(nodes.points_mm)).astype(np.float64)
+    return replace(nodes, area_mm2=each_mm2 * votes)
 
 
 def bending_energy(nodes: Nodes) -> sp.csr_array:
@@ -117,7 +134,9 @@ def fit_offset(
     bed = sp.diags_array(nodes.area_mm2 / length_mm**4)
     stiffness = length_mm**2 / (8.0 * prior_sigma_mm**2)
     information = 1.0 / sigma_mm**2
-    system = sp.csr_array(carry.T @ (sp.diags_array(information) @ carry) + stiffness * (bending_energy(nodes) + bed))
+    system = sp.csr_array(
+        carry.T @ (sp.diags_array(information) @ carry) + stiffness * (bending_energy(nodes) + bed)
+    )
     right = carry.T @ (information * offsets_mm)
     order = reverse_cuthill_mckee(system, symmetric_mode=True).astype(np.int64)
     factor = _banded_factor(sp.csr_array(system[order][:, order]))

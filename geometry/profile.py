@@ -9,6 +9,7 @@ likelihood), apart for the edges, which erode, and the sides. What has no points
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from geometry.chart import (
     NODES,
@@ -60,10 +61,10 @@ class Knots:
         """Weights (p, q, n) of the coefficients in n functions (n, NODES) of the node displacements."""
         u = self.u(np.arange(NODES, dtype=np.float64))
         span = u.astype(np.int64)
-        part = cubic_weights(u, span)
-        along = np.zeros((self.p, len(gradients)))
-        for a in range(4):
-            np.add.at(along, (span + a) % self.p, (part[:, a] * gradients).T)
+        column = (span[:, None] + np.arange(4)) % self.p
+        row = np.repeat(np.arange(NODES), 4)
+        basis = csr_array((cubic_weights(u, span).ravel(), (row, column.ravel())), shape=(NODES, self.p))
+        along = basis.T @ gradients.T
         v = self.v(np.array([z_mm]))
         first = np.clip(v.astype(np.int64), 0, self.q - 4)
         across = np.zeros(self.q)

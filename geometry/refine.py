@@ -51,7 +51,9 @@ def refine(mesh: Mesh, corner_normals: Floats, bends: Bools, longest_mm: float) 
     order = np.argsort(parent, kind="stable")
     normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-300)
     return Refined(
-        mesh=Mesh(vertices_mm=vertices, faces=faces[order]), parent=parent[order], corner_normals=normals[order]
+        mesh=Mesh(vertices_mm=vertices, faces=faces[order]),
+        parent=parent[order],
+        corner_normals=normals[order],
     )
 
 
@@ -83,7 +85,10 @@ def _children(vertices: Floats, faces: Ints, normals: Floats, middle: Ints) -> t
         take(source, tip)
         first = np.linalg.norm(vertices[corners[source, a]] - vertices[corners[source, c]], axis=1)
         second = np.linalg.norm(vertices[corners[source, b]] - vertices[corners[source, d]], axis=1)
-        for chosen, splits in ((first <= second, ((a, b, c), (a, c, d))), (first > second, ((a, b, d), (b, c, d)))):
+        for chosen, splits in (
+            (first <= second, ((a, b, c), (a, c, d))),
+            (first > second, ((a, b, d), (b, c, d))),
+        ):
             for child in splits:
                 take(source[chosen], child)
     return (

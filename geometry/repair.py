@@ -27,6 +27,7 @@ from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh
 FAR = 1e3  # field value of a node whose side is known but whose distance is not
 FLAT_COSINE = float(np.cos(np.deg2rad(20.0)))  # a break at a lower angle to the skin runs out flat
 BORDER_POINTS = 24  # sound points that tell how the skin meets the patch
+SAME_FACE = 0.9  # least cosine between places on one face of the part
 COLLAR = 3  # nodes that the cut body reaches past the skin
 
 
@@ -345,29 +346,29 @@ def _broken_gap(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> float:
 def _border(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> tuple[Measured, Measured]:
     """Largest step (mm) and angle (deg) between the patch's outer skin and the sound skin that it meets.
 
-    At each place of the border a plane through the heights of the nearest `BORDER_POINTS` sound points.
+    At each place of the border a plane through the heights of the nearest `BORDER_POINTS` points that are
+    clear of the break and on the same face of the part; the step is its height in their middle.
     """
-    rim = broken.rim
-    if len(rim.points_mm) < BORDER_POINTS:
-        unseen = NotMeasured(reason=f"{len(rim.points_mm)} scan points on the sound skin round the patch")
+    feet_mm, normals, height_mm = broken.rim.clear_of(broken.points_mm, 2.0 * float(broken.spacing_mm.max()))
+    if len(feet_mm) < BORDER_POINTS:
+        unseen = NotMeasured(reason=f"{len(feet_mm)} scan points on the sound skin round the patch")
         return unseen, unseen
     at_mm = mesh.vertices_mm[np.intersect1d(mesh.faces[outer], mesh.faces[~outer])]
-    _, index = cKDTree(rim.feet_mm).query(at_mm, np.arange(1, BORDER_POINTS + 1))
-    height = ((rim.points_mm - rim.feet_mm) * rim.normals).sum(axis=1)[index]
-    across = frames_along(rim.normals[index[:, 0]])[:, :2]
-    off = np.einsum("nij,nkj->nki", across, rim.feet_mm[index] - at_mm[:, None])
-    inverse = np.linalg.pinv(np.concatenate([np.ones((*index.shape, 1)), off], axis=2))
-    plane = np.einsum("nik,nk->ni", inverse, height)
-    step, slope = np.abs(plane[:, 0]), np.linalg.norm(plane[:, 1:], axis=1)
+    _, index = cKDTree(feet_mm).query(at_mm, np.arange(1, BORDER_POINTS + 1))
+    same = np.einsum("ni,nki->nk", normals[index[:, 0]], normals[index]) > SAME_FACE
+    off_mm = feet_mm[index] - (np.einsum("nk,nki->ni", same, feet_mm[index]) / same.sum(1)[:, None])[:, None]
+    across = np.einsum("nij,nkj->nki", frames_along(normals[index[:, 0]])[:, :2], off_mm)
+    inverse = np.linalg.pinv(same[..., None] * np.concatenate([np.ones((*index.shape, 1)), across], axis=2))
+    plane = np.einsum("nik,nk->ni", inverse, height_mm[index])
     sigma = broken.sigma_mm * np.linalg.norm(inverse, axis=2)
-    i, j = int(step.argmax()), int(slope.argmax())
-    steepness = float(np.linalg.norm(sigma[j, 1:]))
+    slope, slope_sigma = np.linalg.norm(plane[:, 1:], axis=1), np.linalg.norm(sigma[:, 1:], axis=1)
+    i, j = int(np.abs(plane[:, 0]).argmax()), int((slope - slope_sigma).argmax())
     return (
-        Measurand(name="border_step_mm", value=float(step[i]), sigma=float(sigma[i, 0]), unit="mm"),
+        Measurand(name="border_step_mm", value=abs(float(plane[i, 0])), sigma=float(sigma[i, 0]), unit="mm"),
         Measurand(
             name="border_angle_deg",
             value=float(np.rad2deg(np.arctan(slope[j]))),
-            sigma=float(np.rad2deg(steepness)),
+            sigma=float(np.rad2deg(slope_sigma[j])),
             unit="deg",
         ),
     )

@@ -16,6 +16,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh, NotMeasured
 
 CREASE_COSINE = 0.94  # corner normals that differ more belong to different sides of an edge
+COARSER = 2.0  # spacing of the nodes that the free form is fitted to, in those of the offset
 PATCH_CELLS = 0.4  # what the lattice cannot follow is alike over this part of a cell
 FIRST_STIFFNESS = 1e4  # of the free form, before the data set it
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
@@ -68,7 +69,7 @@ def fit_twin(
 ) -> Twin:
     """The twin of a scan, in the nominal frame.
 
-    `mask` (points,) is True where the registration saw damage; it starts the fit, which then decides by itself
+    `mask` (points,) is True where the registration saw damage; it starts the fit, which then judges
     what stands out. Two steps: a volumetric cubic B-spline moves and swells the airfoil as a whole and
     extrapolates over what is missing; an offset along the normal takes up the ripple where it is seen.
     Raises `CannotFitTwin` when sound points do not hold enough of the airfoil.
@@ -108,7 +109,8 @@ class _Ground:
     refined: Refined
     nodes: Nodes
     graph: Ints  # (nodes, k) neighbours
-    patch_nodes: float  # nodes over which the misfit of the free form is alike
+    coarse: Nodes  # what the free form is fitted to
+    patch_nodes: float  # coarse nodes over which the misfit of the free form is alike
 
 
 def _prepare(nominal: Nominal, points: int, settings: TwinSettings) -> _Ground:
@@ -116,13 +118,15 @@ def _prepare(nominal: Nominal, points: int, settings: TwinSettings) -> _Ground:
     corners = solid_normals(nominal.mesh).corner
     refined = refine(nominal.mesh, corners, nominal.airfoil_face, lattice.cell_mm / 6.0)
     nodes = _scatter(nominal, refined, min(settings.nodes, max(points // 4, 100)))
+    coarse = scatter_nodes(nodes.points_mm, nodes.normals, 1.0, COARSER * nodes.spacing_mm)
     return _Ground(
         nominal=nominal,
         lattice=lattice,
         refined=refined,
         nodes=nodes,
         graph=nodes.graph(),
-        patch_nodes=max((PATCH_CELLS * lattice.cell_mm / nodes.spacing_mm) ** 2, 1.0),
+        coarse=coarse,
+        patch_nodes=max((PATCH_CELLS * lattice.cell_mm / coarse.spacing_mm) ** 2, 1.0),
     )
 
 
@@ -188,20 +192,18 @@ class _Votes:
     noise_mm: float  # scatter of the points about their node
 
 
-def _gather(found: _Found, chosen: Bools, along_mm: Floats, nodes: Nodes) -> _Votes:
-    owner, size = found.owner[chosen], len(nodes.points_mm)
-    values = np.column_stack([found.feet_mm[chosen], along_mm[chosen]])
+def _gather(feet_mm: Floats, along_mm: Floats, owner: Ints, nodes: Nodes) -> _Votes:
+    """Points (n,) with an owner each, on their nodes."""
+    size = len(nodes.points_mm)
     count = np.bincount(owner, minlength=size).astype(np.float64)
-    sums = np.column_stack([np.bincount(owner, values[:, i], minlength=size) for i in range(4)])
-    mean = sums / np.maximum(count, 1.0)[:, None]
-    residual_mm = found.along_mm[chosen]
-    own_mean = np.bincount(owner, residual_mm, minlength=size) / np.maximum(count, 1.0)
+    mean = [np.bincount(owner, v, minlength=size) / np.maximum(count, 1.0) for v in (*feet_mm.T, along_mm)]
     many = count[owner] >= 3.0
     if not many.any():
         raise CannotFitTwin("too few sound points on the airfoil")
-    spread_mm = (residual_mm - own_mean[owner]) * np.sqrt(count[owner] / np.maximum(count[owner] - 1.0, 1.0))
+    freedom = np.sqrt(count / np.maximum(count - 1.0, 1.0))
+    spread_mm = (along_mm - mean[3][owner]) * freedom[owner]
     noise_mm = max(_spread(spread_mm[many]), NO_NOISE_MM)
-    return _Votes(count=count, centre_mm=mean[:, :3], along_mm=mean[:, 3], noise_mm=noise_mm)
+    return _Votes(count=count, centre_mm=np.column_stack(mean[:3]), along_mm=mean[3], noise_mm=noise_mm)
 
 
 def _spread(values: Floats) -> float:
@@ -256,7 +258,7 @@ def _fit_smooth(
         field = _smooth_round(found, sound, field, stiffness, loose_mm, ground, settings)
         stiffness = field.stiffness
         after_mm = field.along(ground.nodes.points_mm, ground.nodes.normals)
-        settled = bool(np.abs(after_mm - before_mm).max() <= 0.1 * settings.damage_mm)
+        settled = bool(np.abs(after_mm - before_mm).max() <= 0.2 * settings.damage_mm)
         if settled and rounds > LOOSE_ROUNDS:
             return field, rounds, True
         before_mm = after_mm
@@ -277,9 +279,14 @@ def _smooth_round(
     settings: TwinSettings,
 ) -> Freeform:
     """One weighted fit to the node means; nodes of one patch share their misfit, so they count as few."""
-    moved_mm = 0.0 if field is None else field.along(found.feet_mm, found.normals)
-    votes = _gather(found, sound, found.along_mm + moved_mm, ground.nodes)
-    residual = _gather(found, sound, found.along_mm, ground.nodes).along_mm
+    feet_mm, normals, left_mm = (a[sound] for a in (found.feet_mm, found.normals, found.along_mm))
+    owner = ground.coarse.owner(feet_mm, normals)
+    held = owner >= 0
+    feet_mm, normals, left_mm, owner = feet_mm[held], normals[held], left_mm[held], owner[held]
+    votes = _gather(feet_mm, left_mm, owner, ground.coarse)
+    residual, goal_mm = votes.along_mm, votes.along_mm
+    if field is not None:
+        goal_mm = _gather(feet_mm, left_mm + field.along(feet_mm, normals), owner, ground.coarse).along_mm
     held = votes.count > 0.0
     share_mm2 = votes.noise_mm**2 / np.maximum(votes.count, 1.0)
     misfit_mm2 = max(_spread(residual[held]) ** 2 - float(np.median(share_mm2[held])), NO_NOISE_MM**2)
@@ -291,8 +298,8 @@ def _smooth_round(
     return fit_freeform(
         ground.lattice,
         votes.centre_mm[held],
-        ground.nodes.normals[held],
-        votes.along_mm[held],
+        ground.coarse.normals[held],
+        goal_mm[held],
         weights[held],
         stiffness=stiffness,
         slide=1.0 / (ground.patch_nodes * settings.slide_mm**2),
@@ -316,7 +323,7 @@ def _fit_ripple(
     rng: np.random.Generator,
 ) -> tuple[Offset, float]:
     """The offset field that the sound points ask for, and their scatter; each counts by its own sigma."""
-    votes = _gather(found, sound, found.along_mm, ground.nodes)
+    votes = _gather(found.feet_mm[sound], found.along_mm[sound], found.owner[sound], ground.nodes)
     held = votes.count >= 3.0
     ripple_mm2 = float(np.mean(votes.along_mm[held] ** 2 - votes.noise_mm**2 / votes.count[held]))
     relative = sigma_mm[sound] / float(np.median(sigma_mm[sound]))
@@ -398,7 +405,6 @@ def _vertices(
     return shift + _least_move(vertex, normals, along_mm, count), sigma_mm, held & near
 
 
-
 def _largest(vertex: Ints, values: Floats, count: int) -> Floats:
     """The largest of the values (k,) that fall on each vertex."""
     result = np.full(count, -np.inf)
@@ -413,9 +419,7 @@ def _sides(refined: Refined) -> tuple[Ints, Floats]:
     _, first = np.unique(corner_vertex, return_index=True)
     main = corner_normal[first]
     other = np.flatnonzero(np.einsum("cj,cj->c", corner_normal, main[corner_vertex]) < CREASE_COSINE)
-    keys = np.column_stack(
-        [corner_vertex[other], np.round(corner_normal[other] * 64.0).astype(np.int64)]
-    )
+    keys = np.column_stack([corner_vertex[other], np.round(corner_normal[other] * 64.0).astype(np.int64)])
     _, extra = np.unique(keys, axis=0, return_index=True)
     extra = other[extra]
     return (
@@ -425,7 +429,8 @@ def _sides(refined: Refined) -> tuple[Ints, Floats]:
 
 
 def _least_move(vertex: Ints, normals: Floats, along_mm: Floats, count: int) -> Floats:
-    """The shortest move (count, 3) of each vertex that gives every side through it its offset along its normal."""
+    """The shortest move (count, 3) of each vertex that gives every side through it its offset along its
+    normal."""
     damping = 1e-2  # of sides that nearly face each other, as at a sharp trailing edge
     moves = along_mm[:count, None] * normals[:count]
     creased, place = np.unique(vertex[count:], return_inverse=True)

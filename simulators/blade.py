@@ -28,18 +28,19 @@ class BladeShape:
 
     The end coefficients of the shape polynomial give the edge radii, sqrt(2 r / chord) (Kulfan 2008).
     A constant section with linear twist would be a screw and leave its pose free along the axis: hence
-    the tapers, relative losses from bottom to tip.
+    the tapers, relative losses from bottom to tip, and a twist that grows with the height.
     """
 
     chord_mm: float = 45.0
     span_mm: float = 105.0
     twist_deg: float = 25.0
+    twist_growth: float = 0.5  # the twist is this much slower than its mean at the bottom, faster at the tip
     le_radius_mm: float = 0.7
     te_radius_mm: float = 0.4
     thickness: tuple[float, float, float] = (0.115, 0.140, 0.085)  # inner coefficients, of the chord
     camber: float = 0.26  # of a parabola: the largest camber is a quarter of it, in chords
-    chord_taper: float = 0.10
-    thickness_taper: float = 0.20
+    chord_taper: float = 0.15
+    thickness_taper: float = 0.35
     tip_rounding_mm: float = 0.0
 
     def __post_init__(self) -> None:
@@ -97,7 +98,8 @@ class BladeShape:
         return stack
 
     def _twisted(self, flat: Floats, z_mm: Floats) -> Floats:
-        turn = np.radians(self.twist_deg) * (z_mm / self.span_mm - 0.5)
+        height = z_mm / self.span_mm
+        turn = np.radians(self.twist_deg) * (height - 0.5 + self.twist_growth * (height**2 - height))
         c, s = np.cos(turn), np.sin(turn)
         x, y = flat[..., 0], flat[..., 1]
         return np.stack(np.broadcast_arrays(c * x - s * y, s * x + c * y, z_mm), axis=-1)

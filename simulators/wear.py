@@ -41,7 +41,7 @@ class NominalBlade:
     @property
     def scale(self) -> float:
         """Its chord over that of the thesis' blade."""
-        return self.airfoil.chord_mm / 42.7
+        return self.airfoil.chord_mm / 41.5
 
 
 def thesis_nominal(

@@ -49,7 +49,6 @@ KINDS = _table(
     (101, 2, "TURNTABLE NOT RESPONDING", "Check cable and power, then RESET"),
     (102, 2, "TURNTABLE STALL OR LIMIT", "Remove the obstruction, then RESET"),
     (103, 2, "TURNTABLE POSITION UNCERTAIN, must be homed", "RESET (homes)"),
-    (104, 2, "WRONG DEVICE ON THE TURNTABLE PORT", "Swap the cable, then RESET"),
     (111, 2, "SCANNER NOT RESPONDING", "Check network and power, then RESET"),
     (112, 2, "SCANNER IDENTITY OR PROTOCOL CHANGED", "Quality releases the scanner, then RESET"),
     (121, 2, "PLC LINK LOST. The part waits", "Check the network"),
@@ -62,7 +61,6 @@ KINDS = _table(
     (201, 3, "SCAN INCOMPLETE", "Inspect the part again"),
     (202, 3, "SCAN DATA CORRUPT", "Inspect the part again"),
     (204, 3, "COVERAGE TOO LOW", "Clean the part, inspect it again"),
-    (205, 3, "WRONG PART OR ORIENTATION", "Load the part again"),
     (206, 3, "NO PART SEEN", "Load the part"),
     (209, 3, "ALIGNMENT FAILED OR AMBIGUOUS", "Load the part again"),
     (210, 3, "A CHARACTERISTIC WAS NOT MEASURED", "Inspect the part again"),
@@ -72,7 +70,6 @@ KINDS = _table(
     (214, 3, "STOPPED, the part has no verdict", "Inspect the part again"),
     (215, 3, "CALCULATION TIMEOUT", "Inspect the part again"),
     (216, 3, "CALCULATION FAILED", "Inspect the part again; call maintenance if it repeats"),
-    (305, 4, "DISK FILLING UP", "Plan to archive"),
     (306, 4, "DUPLICATE REQUEST", "None; call controls if it repeats"),
 )
 

@@ -54,7 +54,7 @@ async def run_part(cell: Cell, recipe: RecipeFile, job: Job) -> None:
     steps.begin("record")
     alarm = None if failure is None else alarm_number(failure)
     committed = await cell.on_disk(
-        commit, cell.record, job, measurement, verdict, gates, alarm, datetime.now(UTC)
+        commit, cell.record, job, measurement, recipe.plan, verdict, gates, alarm, datetime.now(UTC)
     )
     release(cell, committed, steps.end())
     await cell.on_disk(cell.record.published, job.record_no, utc_now())

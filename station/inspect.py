@@ -40,21 +40,21 @@ def inspect_scan(
 ) -> Inspection:
     """The inspection of one scan, once its files are in `folder`.
 
-    Raises `BadPlan`, `BadScan` or `BadRequest`, and then has changed nothing.
+    Raises `BadPlan`, `BadScan` or `BadRequest`, and then has changed nothing and told no progress.
     """
     begun_s = clock()
     check_serial(serial)
     check_folder(folder)
-    progress("nominal")
-    recipe = prepare_recipe(read_plan(plan_path))
-    prepared_s = clock()
-    progress("read")
+    plan = read_plan(plan_path)
+    planned_s = clock()
     scan = read_scan(scan_path)
     read_s = clock()
+    recipe = prepare_recipe(plan)
+    prepared_s = clock()
     cloud = as_cloud(scan.points_mm, recipe.plan.measurement.sigma_mm)
     measurement = measure_cloud(cloud, recipe, clock, progress)
     verdict = judge(measurement, recipe.plan, NO_CELL)
-    spent = {"nominal": prepared_s - begun_s, "read": read_s - prepared_s, "total": clock() - begun_s}
+    spent = {"read": read_s - planned_s, "nominal": prepared_s - read_s, "total": clock() - begun_s}
     measurement = replace(measurement, timing_s={**measurement.timing_s, **spent})
     progress("write")
     inputs = inputs_of(recipe, scan, scan_path.name, serial)

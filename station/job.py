@@ -8,7 +8,7 @@ from typing import Any
 
 from station.events import FindingRow, VerdictWord
 from station.findings import Finding
-from station.gates import Gates
+from station.gates import ACCEPTANCE, Gates, alignment_doubts
 from station.journal import (
     Frame,
     InputFile,
@@ -21,11 +21,12 @@ from station.journal import (
 )
 from station.measurement import Measurement
 from station.numbers import numbers
+from station.plans import BladePlan
 from station.proof import Decision, Figures
 from station.publish import figures
 from station.reasons import reason_number
 from station.record import CommittedVerdict, Record, Request, Ticket
-from station.verdict import Verdict
+from station.verdict import Verdict, unseen
 
 
 @dataclass(slots=True, kw_only=True)
@@ -59,6 +60,7 @@ def commit(
     record: Record,
     job: Job,
     measurement: Measurement,
+    plan: BladePlan,
     verdict: Verdict,
     gates: Gates,
     reason_no: int | None,
@@ -68,17 +70,18 @@ def commit(
 
     `reason_no` names the alarm of a failure that prevented the measurement."""
     keep_json(job.folder, "measurement.json", numbers(measurement))
-    decision = decided(measurement, verdict, gates, reason_no, {}, now)
+    decision = decided(measurement, plan, verdict, gates, reason_no, {}, now)
     keep_json(job.folder, "verdict.json", asdict(decision))
     files = digests(job.folder)
     lost = [frame.file for frame in job.frames if files.get(frame.file) != frame.sha256]
     if lost:
         raise OSError(f"{job.folder / lost[0]} is not what the scanner sent")
-    return record.decide(job.record_no, decided(measurement, verdict, gates, reason_no, files, now))
+    return record.decide(job.record_no, decided(measurement, plan, verdict, gates, reason_no, files, now))
 
 
 def decided(
     measurement: Measurement,
+    plan: BladePlan,
     verdict: Verdict,
     gates: Gates,
     reason_no: int | None,
@@ -93,6 +96,7 @@ def decided(
         reasons=verdict.reasons,
         findings=tuple(finding_row(finding) for finding in verdict.findings),
         gates=gate_states(gates),
+        evidence=evidence_of(measurement, plan),
         reason_no=reason_number(verdict, gates) if reason_no is None else reason_no,
         figures=figures(measurement, verdict),
         files=files,
@@ -114,6 +118,16 @@ def finding_row(finding: Finding) -> FindingRow:
     )
 
 
+def evidence_of(measurement: Measurement, plan: BladePlan) -> dict[str, bool]:
+    """What besides its findings a verdict needs (`proof.EVIDENCE`)."""
+    return {
+        "alignment": not any(alignment_doubts(measurement, plan, ACCEPTANCE)),
+        "coverage": not any(unseen(measurement, plan)),
+        "damage": measurement.damages is not None,
+        "steps": not measurement.failures,
+    }
+
+
 def gate_states(gates: Gates) -> dict[str, bool]:
     """Whether each gate of the cell holds."""
     return {each.name: getattr(gates, each.name).holds is True for each in fields(gates)}
@@ -131,6 +145,7 @@ def close_unjudged(record: Record, record_no: int, reason_no: int, why: str, now
         reasons=(why,),
         findings=(),
         gates={"continuity": False},
+        evidence={},
         reason_no=reason_no,
         figures=Figures(),
         files=digests(job_folder(record.directory, record_no)),

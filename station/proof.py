@@ -12,6 +12,8 @@ from typing import Any, Self
 
 from station.events import FindingRow, VerdictWord
 
+EVIDENCE = ("alignment", "coverage", "damage", "steps")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures:
@@ -25,7 +27,9 @@ class Figures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """One verdict with all that carries it. `gates`: each must be true for any word but HOLD.
+    """One verdict with all that carries it. `gates`: each must be true for any word but HOLD. `evidence`:
+    whether the alignment was accepted, the surface seen, damage looked for and every step made; SCRAP needs
+    the alignment, PASS and REPAIR all of them.
     `reason_no`: the number of docs/wire/plc.md, 0 for PASS. `files`: SHA-256 by path in the job folder."""
 
     verdict: VerdictWord
@@ -33,6 +37,7 @@ class Decision:
     reasons: tuple[str, ...]
     findings: tuple[FindingRow, ...]
     gates: Mapping[str, bool]
+    evidence: Mapping[str, bool]
     reason_no: int
     figures: Figures
     files: Mapping[str, str]
@@ -60,13 +65,19 @@ def unproven(decision: Decision) -> str | None:
         return "an interrupted request has no verdict"
     if decision.verdict == "HOLD":
         return None if decision.reasons else "a HOLD without a reason"
-    open_gates = [name for name, closed in decision.gates.items() if closed is not True]
-    if open_gates or not decision.gates:
-        return f"open gates: {', '.join(open_gates) or 'none was checked'}"
+    needed = {**decision.gates, **_needed_evidence(decision)}
+    lacking = [name for name, holds in needed.items() if holds is not True]
+    if lacking or not decision.gates:
+        return f"does not hold: {', '.join(lacking) or 'no gate was checked'}"
     wrong = [row.characteristic for row in decision.findings if not _carried(row)]
     if wrong:
         return f"{wrong[0]}: its numbers do not carry its outcome"
     return _word_without_proof(decision)
+
+
+def _needed_evidence(decision: Decision) -> dict[str, bool]:
+    names = ("alignment",) if decision.verdict == "SCRAP" else EVIDENCE
+    return {name: decision.evidence.get(name, False) for name in names}
 
 
 def _word_without_proof(decision: Decision) -> str | None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).parent / "templates"
 MAP_HEIGHT_PX = 520
-MAP_POINTS = 250_000
+MAP_POINTS = 120_000
 
 SENTENCES = {
     "PASS": "Serviceable as it is.",
@@ -114,7 +114,9 @@ def deviation_map(measurement: Measurement, plan: BladePlan) -> Map | None:
     views = deviation_views(
         measurement.aligned_mm[::step],
         measurement.deviation_mm[::step],
-        measurement.aligned_mm[:0] if twin is None else twin.vertices_mm,
+        measurement.aligned_mm[:0]
+        if twin is None
+        else twin.vertices_mm[:: -(-len(twin.vertices_mm) // MAP_POINTS)],
         full_mm,
         MAP_HEIGHT_PX,
     )

@@ -16,7 +16,7 @@ def shown(steps: int) -> Iterator[Callable[[str], None]]:
         return
     columns = (TextColumn("{task.description:<10}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task("", total=steps)
+        task = bars.add_task("read", total=steps)
 
         def advance(step: str) -> None:
             bars.update(task, description=step, advance=1)

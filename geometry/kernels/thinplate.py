@@ -143,7 +143,13 @@ def _frame(normal: Floats, frame: Floats) -> None:
 
 @njit(cache=True, nogil=True)
 def linear_weights(
-    points: Floats, normals: Floats, nodes: Floats, node_normals: Floats, found: Ints, rho: Floats, reach: float
+    points: Floats,
+    normals: Floats,
+    nodes: Floats,
+    node_normals: Floats,
+    found: Ints,
+    rho: Floats,
+    reach: float,
 ) -> Floats:
     """Weights (n, width) that interpolate a linear function of the unrolled surface from the nodes found.
 
@@ -183,7 +189,8 @@ def linear_weights(
 
 @njit(cache=True, nogil=True)
 def bending_rows(nodes: Floats, normals: Floats, found: Ints, rho: Floats, reach: float) -> Floats:
-    """Rows (n, 3, width) that give s_uu, sqrt(2) s_uv, s_vv at each node from the nodes found, itself among them.
+    """Rows (n, 3, width) that give s_uu, sqrt(2) s_uv, s_vv at each node from the nodes found, itself
+    among them.
 
     A quadric through the node's own value is fitted to its neighbours by weighted least squares over the
     unrolled surface. Zero rows where the neighbours do not determine one.

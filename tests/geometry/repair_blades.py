@@ -89,10 +89,10 @@ def frame_with_z(direction: Array) -> Array:
 
 
 def wavy_cutter(
-    at_mm: Array, outward: Array, wave_mm: float = 0.35, length_mm: float = 4.0, half_mm: float = 40.0
+    at_mm: Array, outward: Array, wave_mm: float = 0.35, length_mm: float = 4.0, half_mm: float = 27.0
 ) -> manifold3d.Manifold:
     """All that lies beyond a wavy surface through `at_mm` that faces `outward`."""
-    n = int(2.0 * half_mm / 0.25)
+    n = int(2.0 * half_mm / 0.3)
     u = np.linspace(-half_mm, half_mm, n + 1)
     grid = np.stack(np.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2)
     height = (
@@ -321,9 +321,7 @@ def without(scanned: Specimen, gone: NDArray[np.bool_]) -> Specimen:
     cloud, damages = scanned.cloud, scanned.damages
     return replace(
         scanned,
-        cloud=Cloud(
-            points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept]
-        ),
+        cloud=Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept]),
         damages=tuple(replace(d, points=number[d.points[kept[d.points]]]) for d in damages),
         on_break=scanned.on_break[kept],
     )

@@ -33,7 +33,9 @@ def _untwisted(theta: Array) -> tuple[Array, Array]:
     half = 0.5 * np.sin(theta) * _shape(x)
     slope = CAMBER * (1.0 - 2.0 * x)
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
-    return CHORD_MM * (x - 0.45 - half * slope * cosine), CHORD_MM * (CAMBER * x * (1.0 - x) + half * cosine - 0.04)
+    return CHORD_MM * (x - 0.45 - half * slope * cosine), CHORD_MM * (
+        CAMBER * x * (1.0 - x) + half * cosine - 0.04
+    )
 
 
 def nominal(theta: Array, z: Array) -> Array:
@@ -171,7 +173,9 @@ class Truth:
         return (self.distance(points) < 0.0) & (points[:, 2] < SPAN_MM) & (points[:, 2] > 0.0)
 
 
-def grid(pitch_mm: float, z_low: float = 0.0, z_high: float = SPAN_MM, turn: float = 0.25) -> tuple[Array, Array]:
+def grid(
+    pitch_mm: float, z_low: float = 0.0, z_high: float = SPAN_MM, turn: float = 0.25
+) -> tuple[Array, Array]:
     """theta, z (rows, columns) of a grid whose cells are `pitch_mm` long and turn at most `turn` rad."""
     dense = np.linspace(0.0, 2.0 * pi, 40001)
     x, y = _untwisted(dense)
@@ -185,14 +189,19 @@ def grid(pitch_mm: float, z_low: float = 0.0, z_high: float = SPAN_MM, turn: flo
     return tuple(np.meshgrid(theta, z))  # type: ignore[return-value]
 
 
-def solid(pitch_mm: float, shape: Shape = SHAPES["as made"], turn: float = 0.25) -> tuple[Array, NDArray[np.int64]]:
+def solid(
+    pitch_mm: float, shape: Shape = SHAPES["as made"], turn: float = 0.25
+) -> tuple[Array, NDArray[np.int64]]:
     """Closed mesh: vertices (n, 3) and outward faces (m, 3), plane ends at z = 0 and z = SPAN_MM."""
     theta, z = grid(pitch_mm, turn=turn)
     rows, columns = theta.shape
     i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     a, b = i * columns + j, i * columns + (j + 1) % columns
     side = np.concatenate(
-        [np.stack([a, b + columns, b], -1).reshape(-1, 3), np.stack([a, a + columns, b + columns], -1).reshape(-1, 3)]
+        [
+            np.stack([a, b + columns, b], -1).reshape(-1, 3),
+            np.stack([a, a + columns, b + columns], -1).reshape(-1, 3),
+        ]
     )
     vertices = shape.surface(theta, z).reshape(-1, 3)
     caps = []
@@ -208,13 +217,16 @@ def solid(pitch_mm: float, shape: Shape = SHAPES["as made"], turn: float = 0.25)
 
 @dataclass(frozen=True)
 class Cut:
-    """Removed metal: `gone` says which points (n, 3) lie in it, `skin` samples its surface at points per mm2."""
+    """Removed metal: `gone` says which points (n, 3) lie in it, `skin` samples its surface at points per
+    mm2."""
 
     gone: Callable[[Array], NDArray[np.bool_]]
     skin: Callable[[np.random.Generator, float], Array]
 
 
-def _height_field(origin: Array, right: Array, up: Array, wave: Callable[[Array, Array], Array], half: Array) -> Cut:
+def _height_field(
+    origin: Array, right: Array, up: Array, wave: Callable[[Array, Array], Array], half: Array
+) -> Cut:
     """Everything above origin + u right + v (up x right) + wave(u, v) up is gone, for |u|, |v| < half."""
     across = np.cross(up, right)
 
@@ -232,7 +244,9 @@ def _height_field(origin: Array, right: Array, up: Array, wave: Callable[[Array,
 
 
 def _rough(u: Array, v: Array) -> Array:
-    return np.asarray(0.3 * np.sin(0.9 * u + 0.6 * v) + 0.2 * np.sin(1.7 * v + 0.4 * u) + 0.6 * np.sin(0.22 * u))
+    return np.asarray(
+        0.3 * np.sin(0.9 * u + 0.6 * v) + 0.2 * np.sin(1.7 * v + 0.4 * u) + 0.6 * np.sin(0.22 * u)
+    )
 
 
 def tip_corner() -> Cut:
@@ -296,7 +310,9 @@ def dented(shape: Shape, theta: float, z: float, depth_mm: float, width_mm: floa
 
     def offset(t: Array, h: Array) -> Array:
         r = np.linalg.norm(shape.surface(t, h) - centre, axis=-1)
-        return np.asarray(shape.offset(t, h) - depth_mm * np.cos(0.5 * pi * np.clip(2.0 * r / width_mm, 0.0, 1.0)) ** 2)
+        return np.asarray(
+            shape.offset(t, h) - depth_mm * np.cos(0.5 * pi * np.clip(2.0 * r / width_mm, 0.0, 1.0)) ** 2
+        )
 
     return Shape(offset, shape.warp)
 

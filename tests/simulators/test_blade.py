@@ -68,7 +68,7 @@ def test_the_edges_have_their_radii() -> None:
 
 
 def test_the_sections_turn_by_the_twist() -> None:
-    even = BladeShape(chord_taper=0.0, thickness_taper=0.0)
+    even = BladeShape(chord_taper=0.0, thickness_taper=0.0, twist_growth=0.0)
     bottom, top = (section_curve(even.surface, z, STILL) for z in (0.0, 8.4))
     assert orientation_deg(bottom, top) == pytest.approx(25.0 * 8.4 / 105.0, abs=1e-3)
 
@@ -134,7 +134,7 @@ def test_a_rounded_tip_loses_its_edge_and_stays_closed() -> None:
     solid = blade_solid(shape, shape.surface)
     sharp = blade_solid(SHAPE, SHAPE.surface)
     assert to_manifold(solid).genus() == 0
-    perimeter = 2.0 * 41.5
+    perimeter = 2.0 * 39.5  # of a thin section about 38.3 mm long
     lost = (1.0 - np.pi / 4.0) * 0.25**2 * perimeter
     assert sharp.volume_mm3 - solid.volume_mm3 == pytest.approx(lost, rel=0.1)
     assert solid.vertices_mm[:, 2].max() == 105.0

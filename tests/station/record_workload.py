@@ -45,6 +45,7 @@ def decision(word: Any, files: dict[str, str] | None = None, **fields: Any) -> D
         "reasons": ("chord",),
         "findings": (row(word),),
         "gates": {"calibration": True, "daily_check": True, "continuity": True, "mode": True},
+        "evidence": {"alignment": True, "coverage": True, "damage": True, "steps": True},
         "reason_no": 0 if word == "PASS" else 404,
         "figures": Figures(worst_um=100, missing_mm3_x1000=5, defects=1, coverage_x100=9900),
         "files": files or {},

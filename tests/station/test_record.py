@@ -136,6 +136,8 @@ def test_what_must_not_be_delivered_is_a_hold(tmp_path: Path) -> None:
         {"verdict": "PASS", "findings": (workload.row("REPAIR"),)},
         {"verdict": "PASS", "gates": {"calibration": False}},
         {"verdict": "PASS", "gates": {}},
+        {"verdict": "PASS", "evidence": {"alignment": True, "coverage": True, "damage": True}},
+        {"verdict": "SCRAP", "findings": (workload.row("SCRAP"),), "evidence": {"alignment": False}},
         {"verdict": "PASS", "interrupted": True},
         {"verdict": "REPAIR", "findings": (workload.row("PASS"),)},
         {"verdict": "REPAIR", "findings": (workload.row("REPAIR"), workload.row("SCRAP"))},

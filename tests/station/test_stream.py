@@ -183,20 +183,23 @@ async def test_a_client_that_does_not_read_is_dropped_and_the_others_are_served(
         serviceable_mm=None,
         repairable_mm=None,
     )
-    async with EventStream(HOST, 0, lambda intent: None) as stream, client(stream) as (reader, _):
-        async with client(stream) as (deaf, deaf_writer):
-            deaf_writer.transport.pause_reading()  # type: ignore[attr-defined]
-            await until_snapshot_end(reader)
-            loop = asyncio.get_running_loop()
-            slowest_s = 0.0
-            for _ in range(80):
-                before_s = loop.time()
-                stream.emit(cloud)
-                slowest_s = max(slowest_s, loop.time() - before_s)
-                assert await next_event(reader) == cloud
-            assert slowest_s < 0.5
-            assert len(stream._clients) == 1
-            assert deaf is not None
+    async with (
+        EventStream(HOST, 0, lambda intent: None) as stream,
+        client(stream) as (reader, _),
+        client(stream) as (deaf, deaf_writer),
+    ):
+        deaf_writer.transport.pause_reading()  # type: ignore[attr-defined]
+        await until_snapshot_end(reader)
+        loop = asyncio.get_running_loop()
+        slowest_s = 0.0
+        for _ in range(80):
+            before_s = loop.time()
+            stream.emit(cloud)
+            slowest_s = max(slowest_s, loop.time() - before_s)
+            assert await next_event(reader) == cloud
+        assert slowest_s < 0.5
+        assert len(stream._clients) == 1
+        assert deaf is not None
 
 
 async def test_clients_over_the_limit_are_turned_away() -> None:
