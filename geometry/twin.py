@@ -188,22 +188,30 @@ class _Votes:
 
     count: Floats  # (nodes,)
     centre_mm: Floats  # (nodes, 3) mean foot
+    normals: Floats  # (nodes, 3) mean normal, shorter than 1 where the surface turns
     along_mm: Floats  # (nodes,) mean
     noise_mm: float  # scatter of the points about their node
 
 
-def _gather(feet_mm: Floats, along_mm: Floats, owner: Ints, nodes: Nodes) -> _Votes:
+def _gather(feet_mm: Floats, normals: Floats, along_mm: Floats, owner: Ints, nodes: Nodes) -> _Votes:
     """Points (n,) with an owner each, on their nodes."""
     size = len(nodes.points_mm)
     count = np.bincount(owner, minlength=size).astype(np.float64)
-    mean = [np.bincount(owner, v, minlength=size) / np.maximum(count, 1.0) for v in (*feet_mm.T, along_mm)]
+    values = (along_mm, *feet_mm.T, *normals.T)
+    mean = [np.bincount(owner, v, minlength=size) / np.maximum(count, 1.0) for v in values]
     many = count[owner] >= 3.0
     if not many.any():
         raise CannotFitTwin("too few sound points on the airfoil")
     freedom = np.sqrt(count / np.maximum(count - 1.0, 1.0))
-    spread_mm = (along_mm - mean[3][owner]) * freedom[owner]
+    spread_mm = (along_mm - mean[0][owner]) * freedom[owner]
     noise_mm = max(_spread(spread_mm[many]), NO_NOISE_MM)
-    return _Votes(count=count, centre_mm=np.column_stack(mean[:3]), along_mm=mean[3], noise_mm=noise_mm)
+    return _Votes(
+        count=count,
+        centre_mm=np.column_stack(mean[1:4]),
+        normals=np.column_stack(mean[4:]),
+        along_mm=mean[0],
+        noise_mm=noise_mm,
+    )
 
 
 def _spread(values: Floats) -> float:
@@ -283,10 +291,10 @@ def _smooth_round(
     owner = ground.coarse.owner(feet_mm, normals)
     held = owner >= 0
     feet_mm, normals, left_mm, owner = feet_mm[held], normals[held], left_mm[held], owner[held]
-    votes = _gather(feet_mm, left_mm, owner, ground.coarse)
+    votes = _gather(feet_mm, normals, left_mm, owner, ground.coarse)
     residual, goal_mm = votes.along_mm, votes.along_mm
     if field is not None:
-        goal_mm = _gather(feet_mm, left_mm + field.along(feet_mm, normals), owner, ground.coarse).along_mm
+        goal_mm = residual + field.along(votes.centre_mm, votes.normals)
     held = votes.count > 0.0
     share_mm2 = votes.noise_mm**2 / np.maximum(votes.count, 1.0)
     misfit_mm2 = max(_spread(residual[held]) ** 2 - float(np.median(share_mm2[held])), NO_NOISE_MM**2)
@@ -298,7 +306,7 @@ def _smooth_round(
     return fit_freeform(
         ground.lattice,
         votes.centre_mm[held],
-        ground.coarse.normals[held],
+        votes.normals[held],
         goal_mm[held],
         weights[held],
         stiffness=stiffness,
@@ -323,15 +331,16 @@ def _fit_ripple(
     rng: np.random.Generator,
 ) -> tuple[Offset, float]:
     """The offset field that the sound points ask for, and their scatter; each counts by its own sigma."""
-    votes = _gather(found.feet_mm[sound], found.along_mm[sound], found.owner[sound], ground.nodes)
+    feet_mm, normals, along_mm = (a[sound] for a in (found.feet_mm, found.normals, found.along_mm))
+    votes = _gather(feet_mm, normals, along_mm, found.owner[sound], ground.nodes)
     held = votes.count >= 3.0
     ripple_mm2 = float(np.mean(votes.along_mm[held] ** 2 - votes.noise_mm**2 / votes.count[held]))
     relative = sigma_mm[sound] / float(np.median(sigma_mm[sound]))
     offset = fit_offset(
         ground.nodes,
-        found.feet_mm[sound],
-        found.normals[sound],
-        found.along_mm[sound],
+        feet_mm,
+        normals,
+        along_mm,
         votes.noise_mm * relative,
         prior_sigma_mm=float(np.sqrt(max(ripple_mm2, NO_NOISE_MM**2))),
         length_mm=ground.lattice.cell_mm / np.pi,

@@ -7,7 +7,7 @@ pressure side, pi the trailing edge, (pi, 2 pi) the suction side.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from math import comb, isfinite, pi
 
 import numpy as np
@@ -197,6 +197,7 @@ def section_curve(surface: Surface, z_mm: float, T: Floats, count: int = 4000) -
     raise ValueError(f"the plane z = {z_mm} mm does not cut the surface once for each theta")
 
 
+@cache
 def section_thetas(count: int) -> Floats:
     """`count` (even) parameters round a section, symmetric, as dense at the edges as these are sharp.
 
@@ -208,7 +209,9 @@ def section_thetas(count: int) -> Floats:
     density = np.max([_facet_density(side) for side in points], axis=0)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     half = np.interp(np.linspace(0.0, total[-1], count // 2 + 1), total, dense)
-    return np.concatenate([half, 2.0 * pi - half[-2:0:-1]])
+    thetas = np.concatenate([half, 2.0 * pi - half[-2:0:-1]])
+    thetas.flags.writeable = False
+    return thetas
 
 
 def _facet_density(points: Floats) -> Floats:

@@ -16,6 +16,7 @@ from station.plans import read_plan
 from station.recipe import Recipe, axis_of, prepare_recipe
 
 REHEARSED_ANGLES_DEG = (0.0, 180.0)
+REHEARSED_POINTS = 5_000  # of a view: enough for every step, few enough to be quick
 
 
 class GeometryDesk:
@@ -59,13 +60,14 @@ def make_desk(plans: Mapping[int, Path], calibration: Path) -> GeometryDesk:
 def rehearse(desk: GeometryDesk, number: int, recipe: Recipe) -> None:
     """Measures the nominal itself once, so that every kernel is compiled before the first part comes."""
     assert recipe.axis is not None
-    samples, rng = recipe.nominal.samples, np.random.default_rng(0)
-    sigma_mm = recipe.plan.measurement.sigma_mm
+    rng, sigma_mm = np.random.default_rng(0), recipe.plan.measurement.sigma_mm
+    step = -(-len(recipe.nominal.samples.points_mm) // REHEARSED_POINTS)
     desk.begin(number)
     for index, angle_deg in enumerate(REHEARSED_ANGLES_DEG):
-        noise_mm = rng.normal(0.0, sigma_mm, (len(samples.points_mm), 1))
+        points_mm = recipe.nominal.samples.points_mm[index::step]
+        noise_mm = rng.normal(0.0, sigma_mm, (len(points_mm), 1))
+        points_mm = points_mm + noise_mm * recipe.nominal.samples.normals[index::step]
         T_scanner_table = recipe.axis.T_scanner_table0 @ about_z(angle_deg)
-        points_mm = apply(T_scanner_table, samples.points_mm + noise_mm * samples.normals)
-        desk.absorb(View(index=index, angle_deg=angle_deg, points_mm=points_mm))
+        desk.absorb(View(index=index, angle_deg=angle_deg, points_mm=apply(T_scanner_table, points_mm)))
     desk.conclude(lambda step: None)
     desk.begin(number)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from geometry.types import Floats
 from station.findings import Finding, spelled
 from station.pictures import deviation_views, legend_stops
 from station.plans import Limit, same_z
@@ -106,21 +107,23 @@ def plot_of(section: Section, measurement: Measurement, plan: BladePlan) -> Sect
 
 def deviation_map(measurement: Measurement, plan: BladePlan) -> Map | None:
     """The map of the aligned scan, its full colour at the largest serviceable limit of profile or form."""
-    count = len(measurement.aligned_mm)
-    if count < 3:
+    if len(measurement.aligned_mm) < 3:
         return None
     full_mm = max((limit.serviceable for limit in form_limits(plan)), default=0.2) or 0.2
-    step, twin = -(-count // MAP_POINTS), measurement.twin_mesh
+    twin = measurement.twin_mesh
     views = deviation_views(
-        measurement.aligned_mm[::step],
-        measurement.deviation_mm[::step],
-        measurement.aligned_mm[:0]
-        if twin is None
-        else twin.vertices_mm[:: -(-len(twin.vertices_mm) // MAP_POINTS)],
+        thinned(measurement.aligned_mm),
+        thinned(measurement.deviation_mm),
+        thinned(measurement.aligned_mm[:0] if twin is None else twin.vertices_mm),
         full_mm,
         MAP_HEIGHT_PX,
     )
     return Map(views=tuple(views), full_mm=full_mm, stops=tuple(legend_stops(full_mm)))
+
+
+def thinned(values: Floats) -> Floats:
+    """Every so many of the rows, so that at most `MAP_POINTS` are drawn."""
+    return values[:: -(-len(values) // MAP_POINTS) or 1]
 
 
 def form_limits(plan: BladePlan) -> list[Limit]:

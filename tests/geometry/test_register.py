@@ -163,8 +163,11 @@ def test_a_screw_with_its_tip_face_is_held():
 def test_a_wrong_part_is_not_explained():
     rng = np.random.default_rng(50)
     other = blades.Blade(chord_mm=38.0, thickness_mm=6.5, camber=0.12, twist_deg=40.0)
-    alignment = register(seen_from(blades.scan(other, 1.0, rng), pose(50)), nominal())
-    assert alignment.explained_fraction < 0.5
+    try:
+        explained = register(seen_from(blades.scan(other, 1.0, rng), pose(50)), nominal()).explained_fraction
+    except CannotRegister:
+        explained = 0.0  # refused outright, which is a HOLD too
+    assert explained < 0.5
 
 
 def test_the_same_points_in_another_order_give_the_same_pose():

@@ -30,7 +30,7 @@ from station.operate import run_forever
 HOST = "127.0.0.1"
 UP = Ctrl.ENABLE | Ctrl.PART_PRESENT
 ANGLES_DEG = (0, 90, 180)
-WAIT_S = 20.0
+WAIT_S = 40.0
 
 PLAN = """
 schema = "bladecell.plan/1"
@@ -112,8 +112,12 @@ class Plc:
         await self._send()
 
     async def _send(self) -> None:
+        """Writes 0-28; waits for a station that is not there yet."""
         registers = encode_request(self.request)
-        assert await self._call(self._client.write_multiple_registers, 0, registers)
+        deadline_s = time.monotonic() + WAIT_S
+        while not await self._call(self._client.write_multiple_registers, 0, registers):
+            assert time.monotonic() < deadline_s, "no station"
+            await asyncio.sleep(0.1)
 
     async def _call(self, call: Callable[..., Any], *arguments: Any) -> Any:
         async with self._lock:  # the client is not for two threads at once
@@ -122,8 +126,7 @@ class Plc:
     async def read(self) -> list[int]:
         """Registers 100-139 in one go."""
         registers = await self._call(self._client.read_holding_registers, 100, 40)
-        assert registers is not None
-        return [int(each) for each in registers]
+        return [int(each) for each in registers or [0] * 40]
 
     async def status(self) -> StatusBits:
         return StatusBits((await self.read())[0])
@@ -156,6 +159,18 @@ class Plc:
                 self.request = replace(self.request, heartbeat=(self.request.heartbeat + 1) & 0xFFFF)
                 await self._call(self._client.write_single_register, 1, self.request.heartbeat)
             await asyncio.sleep(0.2)
+
+    @classmethod
+    @asynccontextmanager
+    async def talking(cls, port: int) -> AsyncIterator["Plc"]:
+        """A PLC that beats, also while nobody listens."""
+        plc = cls(port)
+        beating = asyncio.create_task(plc.run())
+        try:
+            yield plc
+        finally:
+            beating.cancel()
+            plc.close()
 
     def __post_init__(self) -> None:
         self._client = ModbusClient(HOST, self.port, unit_id=1, timeout=5.0, auto_open=True)
@@ -250,16 +265,13 @@ async def station(
             )
         )
         running = asyncio.create_task(run_forever(cell))
-        plc = Plc(cell.plc.port)
+        plc = await stack.enter_async_context(Plc.talking(cell.plc.port))
         await plc.write()
-        beating = asyncio.create_task(plc.run())
         try:
             yield Rig(folder, cell, plc, turntable, scanner, events, running)
         finally:
-            beating.cancel()
             cell.leave()
             await asyncio.wait_for(_quietly(running), 20.0)
-            plc.close()
 
 
 async def _quietly(task: Awaitable[None]) -> None:

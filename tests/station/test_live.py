@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager
@@ -290,6 +292,54 @@ async def test_a_verdict_stands_after_a_restart_and_an_interrupted_request_does_
         assert block[9] == FaultCode.NEW_SEQUENCE_NEEDED
         assert not block[0] & VALID
     assert verify(tmp_path / "record") == ()
+
+
+async def killed(process: asyncio.subprocess.Process) -> None:
+    process.kill()
+    await process.wait()
+
+
+async def test_killed_twice_the_record_holds_and_nothing_is_told_twice(
+    station: Stations, tmp_path: Path
+) -> None:
+    """kill -9 in the middle of a part, then while a verdict stands; each time the same command starts again."""
+    import live_rig
+
+    async def start() -> asyncio.subprocess.Process:
+        script = [str(HERE / "live_station.py"), str(config)]
+        environment = os.environ | {"PYTHONPATH": str(HERE.parents[1])}
+        return await asyncio.create_subprocess_exec(sys.executable, *script, env=environment)
+
+    async with live_rig.devices() as (_, scanner, ports):
+        free = {"plc": live_rig.free_port(), "events": live_rig.free_port()}
+        config = live_rig.write_files(
+            tmp_path, ports | free, mode="SIMULATION", scanner_serial=scanner.serial
+        )
+        async with live_rig.Plc.talking(free["plc"]) as plc:
+            process = await start()
+            await plc.write()
+            await plc.until_bits(READY)
+            await plc.ask(1, recipe=7)
+            await plc.until_bits(START_ACK | BUSY)
+            await killed(process)
+            assert verify(tmp_path / "record") == ()
+            process = await start()
+            await plc.ask(1, recipe=7)
+            assert (await plc.until(lambda block: block[9] != 0))[9] == FaultCode.NEW_SEQUENCE_NEEDED
+            await plc.write(ctrl=UP)
+            await plc.until_bits(READY)
+            await plc.ask(2, "SN-2", recipe=2)
+            before = await plc.until_bits(VALID)
+            await killed(process)
+            assert verify(tmp_path / "record") == ()
+            process = await start()
+            after = await plc.until_bits(VALID)
+            assert (after[4:40], after[2] - before[2]) == (before[4:40], 1)
+            await plc.answer(2)
+            process.terminate()
+            assert await process.wait() == 0
+    interrupted, answered = read_requests(tmp_path / "record")
+    assert (interrupted.verdict, answered.verdict, answered.phase) == ("HOLD", "REPAIR", "ACKED")
 
 
 async def test_maintenance_is_never_ready(station: Stations, tmp_path: Path) -> None:

@@ -252,6 +252,13 @@ def test_damage_that_could_be_overlooked_holds(limit: Any) -> None:
     assert Cause.DETECTION in {reason.cause for reason in done.because}
 
 
+def test_without_a_detection_limit_no_damage_is_no_proof() -> None:
+    done = verdict(detection_mm={zone: lost("no point is sound") for zone in ZONES})
+    assert finding(done, "damage.surface.depth_mm").reason == "no detection limit: no point is sound"
+    assert finding(verdict(detection_mm={}), "damage.surface.depth_mm").reason == "no detection limit"
+    assert done.verdict == Word.HOLD
+
+
 def test_the_detection_limit_may_reach_the_serviceable_depth_less_its_u() -> None:
     sharp = {zone: number("depth_mm", 0.375, 0.0625) for zone in ZONES}  # 0.375 == 0.5 - 2 * 0.0625
     assert verdict(detection_mm=sharp).verdict == Word.PASS
