@@ -302,7 +302,7 @@ async def killed(process: asyncio.subprocess.Process) -> None:
 async def test_killed_twice_the_record_holds_and_nothing_is_told_twice(
     station: Stations, tmp_path: Path
 ) -> None:
-    """kill -9 in the middle of a part, then while a verdict stands; each time the same command starts again."""
+    """kill -9 in mid-part, then while a verdict stands: each time the same command starts again."""
     import live_rig
 
     async def start() -> asyncio.subprocess.Process:
