@@ -17,8 +17,8 @@ IRLS_STEPS = 4
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaskSettings:
     neighbours: int = 16
-    high: float = 5.0  # of the scale: certainly damaged
-    low: float = 2.5  # damaged if joined to what certainly is
+    high: float = 7.0  # of the scale: certainly damaged; among a million points noise does not reach it
+    low: float = 3.0  # damaged if joined to what certainly is
     form_mm: float = 0.15  # smooth deviations up to this are form, not damage
     form_points: int = 15_000  # of the cloud, to find them
     form_nodes: int = 1000  # local fits

@@ -274,8 +274,14 @@ class Record:
 
 
 def fold(request: Request | None, entry: Entry) -> Request:
-    """The request after `entry`; `RecordBroken` when that entry cannot follow."""
-    body = json.loads(entry.body)
+    """The request after `entry`; `RecordBroken` when that entry cannot follow or cannot be read."""
+    try:
+        return _folded(request, entry, json.loads(entry.body))
+    except (TypeError, KeyError, ValueError) as error:
+        raise RecordBroken(f"entry {entry.entry_no}: {entry.phase} cannot be read: {error}") from error
+
+
+def _folded(request: Request | None, entry: Entry, body: dict[str, Any]) -> Request:
     if entry.phase == "ACCEPTED" and request is None:
         return Request(record_no=entry.record_no, ticket=Ticket(**body))
     if request is None or request.record_no != entry.record_no or entry.phase == "ACCEPTED":

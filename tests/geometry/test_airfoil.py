@@ -125,6 +125,7 @@ def test_signs_of_position_and_orientation(shift, turn):
     assert m["orientation_deg"].value == pytest.approx(turn, abs=0.006)
 
 
+@pytest.mark.timeout(400)
 def test_sigmas_are_honest():
     """Error over sigma has a standard deviation of one, over random parts, noises and samplings."""
     names = [name for name in SECTION_MEASURANDS if name != "position_mm"]

@@ -186,6 +186,7 @@ def test_thickness_at_a_gauge_is_that_of_the_disc_there():
     assert thickness(curve, pair).value == pytest.approx(2.0 * radius, abs=0.02)
 
 
+@pytest.mark.timeout(400)
 def test_two_thousand_airfoils_are_measured_without_a_failure():
     """Chords of 10 to 100 mm, up to 25 % camber, edges from 0.3 % of the chord: values are the discs'."""
     rng = np.random.default_rng(0)

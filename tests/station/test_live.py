@@ -299,6 +299,7 @@ async def killed(process: asyncio.subprocess.Process) -> None:
     await process.wait()
 
 
+@pytest.mark.timeout(400)
 async def test_killed_twice_the_record_holds_and_nothing_is_told_twice(
     station: Stations, tmp_path: Path
 ) -> None:
