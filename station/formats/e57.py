@@ -1,4 +1,7 @@
-"""E57 (ASTM E2807) through pye57, an extra. The standard states lengths in metres."""
+"""E57 (ASTM E2807) through pye57, an extra.
+
+The standard means metres; here the numbers are mm, as in every scan of ours. A file in metres is too small
+to be aligned and ends as HOLD, never as a blade of another size."""
 
 import struct
 from pathlib import Path
@@ -8,7 +11,6 @@ import numpy as np
 from geometry.types import Floats
 from station.formats.malformed import Malformed
 
-MM_PER_M = 1000.0
 HEADER = struct.Struct("<8sIIQ")  # signature, version, version, length of the file
 
 
@@ -30,4 +32,4 @@ def e57_points(path: Path, content: bytes) -> Floats:
         clouds = [np.stack([scan[axis] for axis in axes], axis=1) for scan in scans]
     except Exception as error:
         raise Malformed(f"E57: {str(error).splitlines()[0] if str(error) else 'unreadable'}") from error
-    return MM_PER_M * np.concatenate([np.empty((0, 3)), *clouds])
+    return np.concatenate([np.empty((0, 3)), *clouds])

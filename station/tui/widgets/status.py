@@ -66,7 +66,7 @@ class Devices(Panel):
         for name in DEVICE_ORDER:
             device = state.devices.get(name, DeviceStatus(device=name, state="OFFLINE"))
             mark, look = DEVICE_MARK[device.state]
-            text.append(f" {mark} {name:<10}{device.state:<11}{device.detail}"[:60] + "\n", style=look)
+            text.append(f" {mark} {name:<10}{device.state:<11}{device.detail}"[:35] + "\n", style=look)
         return text
 
 
