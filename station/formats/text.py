@@ -27,7 +27,8 @@ def text_points(content: bytes) -> Floats:
 
 
 def split(row: bytes, delimiter: str | None) -> list[str]:
-    return [word.strip(" \t\"'") for word in row.decode("latin-1").split(delimiter)]
+    """The words of a row, at least one: bytes that are blank only as characters make an empty one."""
+    return [word.strip(" \t\"'") for word in row.decode("latin-1").split(delimiter)] or [""]
 
 
 def is_number(word: str) -> bool:

@@ -29,7 +29,8 @@ def test_a_surface_of_uneven_density_with_a_far_cluster_matches_a_tree():
     sheet = np.column_stack(
         [rng.exponential(10.0, 5000), rng.uniform(0, 100, 5000), rng.normal(scale=0.01, size=5000)]
     )
-    points = np.concatenate([sheet, [*rng.normal(scale=0.1, size=(40, 3)), 500.0, -300.0, 80.0]])
+    far = rng.normal(scale=0.1, size=(40, 3)) + np.array([500.0, -300.0, 80.0])
+    points = np.concatenate([sheet, far])
     _, distances = k_nearest(points, 16)
     assert np.abs(distances - cKDTree(points).query(points, 16)[0]).max() < 1e-12
 

@@ -317,6 +317,12 @@ def read_or_refuse(path: Path) -> Scan | str:
         return str(error)
 
 
+@pytest.mark.parametrize("content", [b"\x85", b"\x1c", b"\xa0\n1 2 3\n"])
+def test_blanks_that_only_characters_know_are_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "blank.asc").write_bytes(content)
+    assert isinstance(read_or_refuse(tmp_path / "blank.asc"), str)
+
+
 @settings(max_examples=400, deadline=None)
 @given(st.data())
 def test_any_bytes_give_points_or_a_line(

@@ -84,6 +84,7 @@ def inspect(folder: Path, name: str, out: Path) -> Inspection:
     )
 
 
+@pytest.mark.timeout(500)  # the whole chain, on a machine that does other things too
 def test_a_broken_tip_is_measured_and_filled(folder: Path, tmp_path: Path) -> None:
     done = inspect(folder, "cut.ply", tmp_path)
     result: dict[str, Any] = json.loads((tmp_path / "result.json").read_text())
