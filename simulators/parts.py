@@ -73,10 +73,16 @@ class SimPart:
 
 
 def _section_row(section: SectionTruth) -> dict[str, float]:
-    row = asdict(section)
-    actual = row.pop("actual")
-    row.pop("nominal")
-    return row | actual
+    return {
+        "z_mm": section.z_mm,
+        "position_x_mm": section.position_x_mm,
+        "position_y_mm": section.position_y_mm,
+        "orientation_deg": section.orientation_deg,
+        "chord_mm": section.actual.chord_mm,
+        "max_thickness_mm": section.actual.max_thickness_mm,
+        "profile_max_mm": section.profile_max_mm,
+        "profile_min_mm": section.profile_min_mm,
+    }
 
 
 def assemble(

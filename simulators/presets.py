@@ -27,6 +27,7 @@ __all__ = [
     "make_part",
     "nominal_blade",
     "part_for",
+    "preset_named",
     "rig_for",
     "rig_of",
     "write_recipe",
@@ -65,10 +66,9 @@ def part_for(preset: str, seed: int, index: int, nominal: Path | None = None) ->
 
 def make_part(blade: NominalBlade, preset: str, seed: int, index: int = 0) -> SimPart:
     """One part of a preset. Raises ValueError for an unknown one."""
+    preset = preset_named(preset)
     if preset == "demo":
         preset = DEMO[index % len(DEMO)]
-    if preset not in PRESETS:
-        raise ValueError(f"preset {preset!r} is none of {', '.join(PRESETS)}, demo")
     rng = np.random.default_rng([seed, index, crc32(preset.encode())])
     serial = serial_of(seed, index)
     if preset == "HOLD-wrong-part":
@@ -77,6 +77,14 @@ def make_part(blade: NominalBlade, preset: str, seed: int, index: int = 0) -> Si
     optics = OpticsSettings(blind=(_dirt(blade, worn, rng),) if preset == "HOLD-hole" else ())
     cuts = CUTS[preset](blade, worn, rng) if preset in CUTS else []
     return assemble(blade, worn, cuts, preset=preset, serial=serial, seed=seed, optics=optics, rng=rng)
+
+
+def preset_named(text: str) -> str:
+    """The preset of that name in any case; "hold" alone is the part with a hole in its scan."""
+    names = {name.upper(): name for name in (*PRESETS, "demo")} | {"HOLD": "HOLD-hole"}
+    if text.upper() not in names:
+        raise ValueError(f"preset {text!r} is none of {', '.join(PRESETS)}, demo")
+    return names[text.upper()]
 
 
 def serial_of(seed: int, index: int) -> str:

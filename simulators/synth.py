@@ -27,6 +27,7 @@ from simulators.presets import (
     broken_corner,
     make_part,
     nominal_blade,
+    preset_named,
     repairable_nick,
     repairable_pit,
     rig_of,
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="synth", description=__doc__.partition("\n")[0])
     parser.add_argument("--out", required=True, metavar="DIR")
-    parser.add_argument("--preset", default="REPAIR", choices=PRESETS)
+    parser.add_argument("--preset", default="REPAIR", metavar="NAME", help=", ".join(PRESETS))
     parser.add_argument("--nominal", metavar="FILE", help="any closed blade mesh, span along +Z, in mm")
     parser.add_argument("--seed", type=int, default=0, metavar="S")
     parser.add_argument("--noise-mm", type=float, default=0.012, metavar="X", help="along the normal")
@@ -96,7 +97,7 @@ def _order(options: argparse.Namespace) -> Order:
     if not (isfinite(options.noise_mm) and options.noise_mm >= 0.0):
         raise ValueError("--noise-mm is zero or more")
     return Order(
-        preset=options.preset,
+        preset=preset_named(options.preset),
         seed=options.seed,
         noise_mm=options.noise_mm,
         views=options.views,

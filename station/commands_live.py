@@ -35,19 +35,33 @@ REQUEST_COLUMNS = (
 
 
 def run_station(*, config: Path | None, headless: bool) -> int:
-    """`bladecell run`."""
+    """`bladecell run`: with a terminal and an operator, the screen on a station of its own."""
     from station.console import print_line
     from station.run import run
 
-    return run(config, headless=headless, on_event=print_line)
+    if headless or not on_terminal():
+        return run(config, headless=headless, on_event=print_line)
+    try:
+        chosen = find_config(config)
+        directory = read_config(chosen).record_directory
+    except BadFile as error:
+        return complain(str(error), USAGE)
+    from station.demo import watch_station
+
+    directory.mkdir(parents=True, exist_ok=True)
+    return watch_station([sys.executable, "-P", "-m", "station.run", str(chosen)], chosen, directory)
 
 
 def demo(*, headless: bool, parts: int | None, seed: int) -> int:
     """`bladecell demo`."""
     from station.demo import run_demo
 
-    on_terminal = sys.stdin.isatty() and sys.stdout.isatty()
-    return run_demo(headless=headless or not on_terminal, parts=parts, seed=seed)
+    return run_demo(headless=headless or not on_terminal(), parts=parts, seed=seed)
+
+
+def on_terminal() -> bool:
+    """Whether there is somebody to look at a screen."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def tui(*, connect: str | None, config: Path | None) -> int:

@@ -116,14 +116,19 @@ async def run_until_done(config: Path, score: Score) -> None:
 
 
 def watch_parts(folder: Path) -> int:
-    """Opens the operator screen on a station of its own; 0 when the screen was left."""
+    """Opens the operator screen on a station that starts by itself; 0 when the screen was left."""
+    config = folder / "station.toml"
+    command = [sys.executable, "-P", "-m", "station", "run", "--headless", "--config", str(config)]
+    return watch_station(command, config, folder)
+
+
+def watch_station(command: list[str], config: Path, folder: Path) -> int:
+    """Opens the operator screen on the station that `command` runs; its lines go to `folder`/station.log."""
     from station.config import read_config
     from station.tui.app import main
 
-    config = folder / "station.toml"
     events = read_config(config).events
-    command = [sys.executable, "-P", "-m", "station", "run", "--headless", "--config", str(config)]
-    with (folder / "station.log").open("wb") as log, running_process(command, out=log, log=log):
+    with (folder / "station.log").open("ab") as log, running_process(command, out=log, log=log):
         main(events.host, events.port)
     return 0
 

@@ -1,4 +1,7 @@
-"""`bladecell run`: the station against the addresses of its configuration, until SIGTERM."""
+"""`bladecell run`: the station against the addresses of its configuration, until SIGTERM.
+
+`python -m station.run CONFIG` is the station that waits for an operator's START, without a screen.
+"""
 
 import asyncio
 import signal
@@ -12,6 +15,7 @@ from geometry.errors import GeometryError
 from station.cell import Cell, open_cell
 from station.chain import RecordFailed
 from station.config import find_config, read_config
+from station.console import print_line
 from station.events import Event
 from station.operate import run_forever
 from station.result import software_version
@@ -52,3 +56,7 @@ def complain(text: str, status: int) -> int:
     """The exit status, after one line on the standard error stream."""
     sys.stderr.write(f"bladecell: {text.splitlines()[0]}\n")
     return status
+
+
+if __name__ == "__main__":
+    sys.exit(run(Path(sys.argv[1]), headless=False, on_event=print_line))

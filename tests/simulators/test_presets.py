@@ -12,7 +12,15 @@ import pytest
 from scipy.spatial import cKDTree
 
 from simulators.parts import SimPart
-from simulators.presets import PRESETS, make_part, nominal_blade, part_for, rig_for, write_recipe
+from simulators.presets import (
+    PRESETS,
+    make_part,
+    nominal_blade,
+    part_for,
+    preset_named,
+    rig_for,
+    write_recipe,
+)
 from simulators.recipe import Finding, decide
 from simulators.rig import about_z, apply, inverse
 from simulators.solids import face_normals, read_solid, to_manifold
@@ -134,6 +142,10 @@ def test_the_wrong_part_fits_nowhere() -> None:
 def test_an_unknown_preset_is_named() -> None:
     with pytest.raises(ValueError, match="'BROKEN'"):
         make_part(nominal_blade(None), "BROKEN", 0)
+
+
+def test_presets_are_named_in_any_case() -> None:
+    assert [preset_named(text) for text in ("pass", "Hold", "DEMO")] == ["PASS", "HOLD-hole", "demo"]
 
 
 def finding(value: float) -> Finding:

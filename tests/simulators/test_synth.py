@@ -84,6 +84,7 @@ def test_without_form_error_the_blade_is_the_nominal(tmp_path: Path) -> None:
     [
         (["--nominal", "nothing.stl"], "nothing.stl"),
         (["--damage", "tip,dent"], "'dent'"),
+        (["--preset", "BROKEN"], "'BROKEN'"),
         (["--views", "0"], "--views"),
         (["--noise-mm", "nan"], "--noise-mm"),
         (["--z-min-mm", "200"], "airfoil"),
