@@ -21,11 +21,21 @@ def screen_text(app: OperatorScreen) -> str:
 
 
 async def show(app: OperatorScreen, pilot: Pilot[None], sequence: list[events.Event]) -> str:
+    """The screen's text after the events, once its footer stands and two looks at it are alike."""
     for event in sequence:
         app.take(event)
-    app.refresh_page()
-    await pilot.pause(0.1)
-    return screen_text(app)
+    text = ""
+    async with asyncio.timeout(20):
+        while True:
+            app.refresh_page()
+            await pilot.pause(0.1)
+            before, text = text, screen_text(app)
+            if app.screen.query("FooterKey") and without_clock(text) == without_clock(before):
+                return text
+
+
+def without_clock(text: str) -> str:
+    return text.partition("\n")[2]
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -55,9 +65,7 @@ async def test_without_a_station_nothing_looks_present() -> None:
         app.workers.cancel_all()
         await show(app, pilot, scenes.SCENES["pass"]())
         app.lose()
-        app.refresh_page()
-        await pilot.pause(0.1)
-        text = screen_text(app)
+        text = await show(app, pilot, [])
         assert "STALE" in text
         assert not any(widget.display for widget in app.screen.query(Verdict))
 
