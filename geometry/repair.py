@@ -6,29 +6,23 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from skimage.measure import marching_cubes
 
 from geometry.broken import BrokenSurface, Scan, Skin, find_broken_surface, frames_along
 from geometry.columns import volume_by_columns
+from geometry.cut_body import cut_body
 from geometry.damage import Damage, DamageKind
 from geometry.errors import BadInput, CannotRepair
-from geometry.kernels.implicit import blend_quadrics
-from geometry.kernels.implicit_solid import column_crossings, nodes_inside
 from geometry.register import Alignment
 from geometry.solid import check_solid, volume_mm3
 from geometry.transforms import apply, inverse
 from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh, NotMeasured, Zone
 
-FAR = 1e3  # field value of a node whose side is known but whose distance is not
-FLAT_COSINE = float(np.cos(np.deg2rad(20.0)))  # a break at a lower angle to the skin runs out flat
 BORDER_POINTS = 24  # sound points that tell how the skin meets the patch
 SAME_FACE = 0.9  # least cosine between places on one face of the part
-COLLAR = 3  # nodes that the cut body reaches past the skin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +133,8 @@ def _patch(
     broken = find_broken_surface(
         skin, scan, damage.points, settings.film_sigmas, settings.max_gap_mm, settings.min_points
     )
-    mesh, outer, dropped_mm3 = _lost_piece(solid, _cut_body(broken, skin, settings), settings)
+    body = cut_body(broken, skin, settings.max_gap_mm, settings.resolution, settings.max_nodes)
+    mesh, outer, dropped_mm3 = _lost_piece(solid, body, settings.sliver_fraction)
     gap_mm = _broken_gap(mesh, outer, broken)
     if not gap_mm <= settings.max_gap_mm:
         raise CannotRepair(f"a hole of {gap_mm:.2f} mm in the scan of the broken surface")
@@ -171,117 +166,6 @@ def _total(patches: Sequence[Patch]) -> Measurand:
     return Measurand(name="volume_mm3", value=value, sigma=sigma, unit="mm3")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Grid:
-    origin_mm: Floats  # (3,)
-    step_mm: float
-    shape: tuple[int, int, int]
-
-
-def _cut_body(broken: BrokenSurface, skin: Skin, settings: RepairSettings) -> Mesh:
-    """The closed surface around the lost metal: the broken surface, then well outside the twin.
-
-    The box grows until the lost metal ends inside it.
-    """
-    step_mm = float(np.sqrt(broken.area_mm2)) / settings.resolution
-    margin_mm = (COLLAR + 2) * step_mm
-    low, high = broken.raw_mm.min(axis=0) - margin_mm, broken.raw_mm.max(axis=0) + margin_mm
-    while True:
-        shape = np.ceil((high - low) / step_mm).astype(int) + 1
-        if float(np.prod(shape, dtype=float)) > settings.max_nodes:
-            raise CannotRepair("the broken surface does not close off the lost metal: seen incompletely")
-        grid = _Grid(origin_mm=low, step_mm=step_mm, shape=(int(shape[0]), int(shape[1]), int(shape[2])))
-        field, lost = _lost_field(grid, broken, skin, settings)
-        more = 0.3 * (high - low)
-        grow_low = np.array([lost.take(0, axis).any() for axis in range(3)])
-        grow_high = np.array([lost.take(-1, axis).any() for axis in range(3)])
-        if not (grow_low.any() or grow_high.any()):
-            return _zero_surface(field, grid)
-        low, high = low - grow_low * more, high + grow_high * more
-
-
-def _lost_field(
-    grid: _Grid, broken: BrokenSurface, skin: Skin, settings: RepairSettings
-) -> tuple[Floats, Bools]:
-    """A field that is positive where metal is lost and just outside it; and the lost nodes in the twin."""
-    reach_mm = 0.5 * settings.max_gap_mm + 2.0 * grid.step_mm
-    field, nearest_mm = blend_quadrics(
-        grid.shape,
-        grid.origin_mm,
-        grid.step_mm,
-        broken.points_mm,
-        broken.frames,
-        broken.bending,
-        1.2 * broken.spacing_mm,
-        reach_mm,
-    )
-    band = np.isfinite(nearest_mm)
-    inside = _inside(grid, skin)
-    _end_flat_rim(field, nearest_mm, inside & band, grid, broken)
-    lost = inside & ((band & (field > 0.0)) | _lost_beyond_band(inside & ~band, band & inside, field))
-    beyond = ndimage.binary_dilation(lost, np.ones((3, 3, 3), bool), COLLAR)
-    return np.where(band, field, np.where(lost | (beyond & ~inside), FAR, -FAR)), lost
-
-
-def _inside(grid: _Grid, skin: Skin) -> Bools:
-    start, height_mm = column_crossings(skin.triangles_mm, grid.origin_mm[:2], grid.step_mm, grid.shape[:2])
-    return np.asarray(nodes_inside(start, height_mm, float(grid.origin_mm[2]), grid.step_mm, grid.shape))
-
-
-def _end_flat_rim(field: Floats, nearest_mm: Floats, band: Bools, grid: _Grid, broken: BrokenSurface) -> None:
-    """End the loss, in `field`, where the break runs out nearly flat and sound skin has been seen beyond it.
-
-    There the continued break and the twin cross anywhere or nowhere. Elsewhere their crossing is the edge of
-    the break, sharper than the points show it, and stays.
-    """
-    _, nearest = cKDTree(broken.points_mm).query(broken.rim.feet_mm)
-    flat = (broken.rim.normals * broken.frames[nearest, 2]).sum(axis=1) > FLAT_COSINE
-    if not flat.any():
-        return
-    margin_mm = 1.5 * float(np.median(broken.spacing_mm))
-    at = np.nonzero(band & (field > 0.0) & (nearest_mm > margin_mm))
-    node_mm = grid.origin_mm + grid.step_mm * np.column_stack(at)
-    to_rim_mm = cKDTree(broken.rim.feet_mm[flat]).query(node_mm)[0]
-    field[at] = np.minimum(field[at], margin_mm + to_rim_mm - nearest_mm[at])
-
-
-def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools:
-    """The free nodes in the twin, out of reach of the broken surface, that lie on its outer side.
-
-    Each connected region takes the side of the band nodes at its border. Raises `CannotRepair` if they
-    contradict each other: then there is a hole in the band.
-    """
-    region, count = ndimage.label(free)
-    votes = np.zeros((count + 1, 2))
-    for axis in range(3):
-        for a, b in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
-            here = tuple(a if i == axis else slice(None) for i in range(3))
-            there = tuple(b if i == axis else slice(None) for i in range(3))
-            meet = (region[here] > 0) & band[there]
-            np.add.at(votes, (region[here][meet], (field[there][meet] > 0.0).astype(int)), 1.0)
-    lost = votes[:, 1] > votes[:, 0]
-    contradicting = votes[1:].min(axis=1).sum()
-    if not contradicting <= 0.02 * votes.sum():
-        raise CannotRepair(
-            "the broken surface is open: lost and sound metal are not separated by scan points"
-        )
-    return np.asarray(lost[region] & free)
-
-
-def _zero_surface(field: Floats, grid: _Grid) -> Mesh:
-    """The closed surface where the field is zero, its normals pointing to negative values."""
-    field = np.clip(field, -2.0 * grid.step_mm, 2.0 * grid.step_mm)
-    if not (field > 0.0).any():
-        raise CannotRepair("no metal is missing under the broken surface")
-    field[field == 0.0] = -1e-9 * grid.step_mm
-    padded = np.pad(field, 1, constant_values=-2.0 * grid.step_mm)
-    vertices, faces, _, _ = marching_cubes(padded.astype(np.float64), 0.0, gradient_direction="ascent")
-    return Mesh(
-        vertices_mm=grid.origin_mm + (vertices.astype(np.float64) - 1.0) * grid.step_mm,
-        faces=faces.astype(np.int64),
-    )
-
-
 def _solid(mesh: Mesh) -> Any:
     solid = manifold3d.Manifold(
         manifold3d.Mesh64(np.array(mesh.vertices_mm), np.array(mesh.faces, dtype=np.uint64))
@@ -291,7 +175,7 @@ def _solid(mesh: Mesh) -> Any:
     return solid
 
 
-def _lost_piece(solid: Any, body: Mesh, settings: RepairSettings) -> tuple[Mesh, Bools, float]:
+def _lost_piece(solid: Any, body: Mesh, sliver_fraction: float) -> tuple[Mesh, Bools, float]:
     """The twin within the cut body without slivers, which of its faces are the twin's, and what was dropped.
 
     Components by graph search on the faces: manifold3d's own decomposition does not come back from
@@ -307,7 +191,7 @@ def _lost_piece(solid: Any, body: Mesh, settings: RepairSettings) -> tuple[Mesh,
     component = _components(faces, len(vertices))
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     volumes = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
-    kept = volumes >= settings.sliver_fraction * volumes.max()
+    kept = volumes >= sliver_fraction * volumes.max()
     own = kept[component]
     used, compact = np.unique(faces[own], return_inverse=True)
     mesh = Mesh(vertices_mm=vertices[used], faces=compact.reshape(-1, 3))

@@ -50,7 +50,7 @@ def blend_quadrics(
                     v = dx * frames[p, 1, 0] + dy * frames[p, 1, 1] + dz * frames[p, 1, 2]
                     n = dx * frames[p, 2, 0] + dy * frames[p, 2, 1] + dz * frames[p, 2, 2]
                     sag = 0.5 * (bending[p, 0] * u * u + 2.0 * bending[p, 1] * u * v + bending[p, 2] * v * v)
-                    far2 = (u * u + v * v) / (9.0 * width2)
+                    far2 = (u * u + v * v) / (2.25 * width2)
                     if far2 > 1.0:  # a quadric is not to be trusted far beyond the points that made it
                         sag /= far2
                     w = width2 * np.exp(-d2 / width2)

@@ -19,7 +19,7 @@ def slow_blend(
         distance = np.linalg.norm(off, axis=1)
         u, v, n = np.einsum("pij,pj->ip", frames, off)
         sag = 0.5 * (bending[:, 0] * u**2 + 2.0 * bending[:, 1] * u * v + bending[:, 2] * v**2)
-        sag = sag / np.maximum(1.0, (u**2 + v**2) / (3.0 * width) ** 2)
+        sag = sag / np.maximum(1.0, (u**2 + v**2) / (1.5 * width) ** 2)
         weight = width**2 * np.exp(-((distance / width) ** 2))
         weight[distance > reach] = 0.0
         if weight.any():
