@@ -12,21 +12,25 @@ from geometry.types import Bools, Floats, Ints
 TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
 BLENDED = 6  # nodes around a point whose local fits are blended there
 IRLS_STEPS = 4
+REACHES = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaskSettings:
     neighbours: int = 16
     high: float = 7.0  # of the scale: certainly damaged; among a million points noise does not reach it
-    low: float = 3.0  # damaged if joined to what certainly is
+    low: float = 2.5  # damaged if joined to what certainly is
     form_mm: float = 0.15  # smooth deviations up to this are form, not damage
+    rim_mm: float = 2.0  # around points that are further off, where a damage may run out
     form_points: int = 15_000  # of the cloud, to find them
     form_nodes: int = 1000  # local fits
     form_window: int = 160  # points in each
 
     def __post_init__(self) -> None:
-        if not (self.neighbours >= 4 and 0.0 < self.low <= self.high and self.form_mm > 0.0):
+        if not (self.neighbours >= 4 and 0.0 < self.low <= self.high):
             raise BadInput(f"mask: {self} contradicts itself")
+        if not (self.form_mm > 0.0 and self.rim_mm >= 0.0):
+            raise BadInput(f"mask: form {self.form_mm} mm and rim {self.rim_mm} mm are no distances")
         if not 20 <= self.form_window <= self.form_nodes <= self.form_points:
             raise BadInput(f"mask: {self} has too few points for a form")
 
@@ -52,22 +56,40 @@ def damaged(residual_mm: Floats, neighbours: Ints, floor_mm: float, settings: Ma
 def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: MaskSettings) -> Floats:
     """The smooth part (n,) of the signed distances: what service or making did to the form.
 
-    Local linear fits over a few millimetres, robust against what is abrupt, blended between their nodes.
-    Distances beyond `form_mm`, or four robust sigmas of all where a blade is bent further, take no part:
-    within a wide damage the form is that of its surroundings.
+    Local fits over a few millimetres, robust against what is abrupt, blended between their nodes. Points
+    further than `form_mm` off, or four robust sigmas of all, take no part, nor do those next to them: within
+    a wide damage the form is that of its surroundings. Where a bent blade leaves the nominal smoothly by
+    more, the fits reach out until no more points join.
     """
     place = np.column_stack([points_mm, TURN_MM * normals])
+    few = _every_nth(len(points_mm), settings.form_points)
     limit_mm = max(settings.form_mm, 4.0 * robust_sigma(distance_mm))
-    near = np.flatnonzero(np.abs(distance_mm) <= limit_mm)
-    if len(near) < settings.form_window:  # nothing of the nominal's form is left to tell
-        return np.zeros(len(points_mm))
-    chosen = near[:: max(1, len(near) // settings.form_points)]
-    nodes = chosen[:: max(1, len(chosen) // settings.form_nodes)]
-    _, members = _nearest(place[chosen], place[nodes], settings.form_window)
-    fits = _local_fits(
-        points_mm[nodes], points_mm[chosen][members], normals[chosen][members], distance_mm[chosen][members]
-    )
+    near = np.abs(distance_mm[few]) <= limit_mm
+    for _ in range(REACHES):
+        chosen = few[_clear(place[few], near, settings.rim_mm)]
+        if len(chosen) < settings.form_window:  # nothing of the nominal's form is left to tell
+            return np.zeros(len(points_mm))
+        nodes = chosen[_every_nth(len(chosen), settings.form_nodes)]
+        _, members = _nearest(place[chosen], place[nodes], settings.form_window)
+        around = chosen[members]
+        fits = _local_fits(points_mm[nodes], points_mm[around], normals[around], distance_mm[around])
+        form_mm = _blend(place[few], place[nodes], normals[few], fits)
+        before, near = near, near | (np.abs(distance_mm[few] - form_mm) <= limit_mm)
+        if np.array_equal(before, near):
+            break
     return _blend(place, place[nodes], normals, fits)
+
+
+def _clear(place: Floats, near: Bools, rim_mm: float) -> Bools:
+    """Of the points (n, 6) near the form, those that no point off it is next to."""
+    if near.all():
+        return near
+    apart, _ = _nearest(place[~near], place, 1)
+    return near & (apart > rim_mm)
+
+
+def _every_nth(count: int, most: int) -> Ints:
+    return np.arange(0, count, max(1, count // most))
 
 
 def _nearest(targets: Floats, places: Floats, k: int) -> tuple[Floats, Ints]:

@@ -5,7 +5,7 @@ import pytest
 
 from geometry.errors import BadInput
 from geometry.kernels.neighbours import k_nearest
-from geometry.mask import MaskSettings, damaged, robust_sigma
+from geometry.mask import MaskSettings, damaged, form_of, robust_sigma
 
 
 def plate(rng, sigma_mm):
@@ -36,7 +36,34 @@ def test_excess_counts_as_much_as_missing():
     assert np.array_equal(up, down)
 
 
-@pytest.mark.parametrize("wrong", [{"low": 6.0}, {"low": 0.0}, {"neighbours": 2}])
+def wedge(rng):
+    """Both sides of a 40 x 30 mm plate, 1 mm thick, and their normals."""
+    top = np.column_stack([rng.uniform([-20, -15], [20, 15], (10_000, 2)), np.full(10_000, 0.5)])
+    points = np.concatenate([top, top * [1.0, 1.0, -1.0]])
+    return points, np.sign(points[:, 2:]) * [0.0, 0.0, 1.0]
+
+
+def test_form_is_the_smooth_part_on_each_side_and_leaves_the_damage():
+    rng = np.random.default_rng(5)
+    points, normals = wedge(rng)
+    x, y, z = points.T
+    bent = 0.08 * np.cos(0.06 * x) * np.sin(0.08 * y + 0.5) * np.sign(z) + 0.01
+    pit = np.where((np.hypot(x, y) < 3.0) & (z > 0), 0.4, 0.0)
+    form = form_of(points, normals, bent - pit + rng.normal(scale=0.01, size=len(points)), MaskSettings())
+    assert np.sqrt(np.mean((form - bent) ** 2)) < 0.004
+    assert np.abs(form - bent)[pit > 0.0].max() < 0.03
+
+
+def test_form_of_a_surface_that_is_nowhere_near_is_nothing():
+    points, normals = wedge(np.random.default_rng(6))
+    far = np.where(np.arange(len(points)) % 2, 3.0, -3.0)
+    settings = MaskSettings(form_nodes=100, form_window=100, form_points=200)
+    assert np.abs(form_of(points[:80], normals[:80], far[:80], settings)).max() == 0.0
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"low": 9.0}, {"low": 0.0}, {"neighbours": 2}, {"form_mm": 0.0}, {"form_window": 5}]
+)
 def test_settings_that_contradict_themselves_are_refused(wrong):
     with pytest.raises(BadInput, match="mask"):
         MaskSettings(**wrong)
