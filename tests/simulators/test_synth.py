@@ -36,7 +36,7 @@ def distance_to_nominal_mm(folder: Path, T_nominal_scan: Floats) -> Floats:
 
 
 def test_a_repairable_blade(tmp_path: Path) -> None:
-    assert main(["--out", str(tmp_path), "--damage", "tip,pit"]) == 0
+    assert main(["--out", str(tmp_path), "--damage", "tip,pit", "--views", "8"]) == 0
     truth = json.loads((tmp_path / "truth.json").read_text())
     plan = tomllib.loads((tmp_path / "plan.toml").read_text())
     assert truth["verdict"] == "REPAIR"
@@ -103,7 +103,7 @@ def test_bad_input_is_one_line_and_status_2(
 
 @needs_real
 def test_a_real_blade_is_found_above_its_platform_and_damaged(tmp_path: Path) -> None:
-    options = ["--out", str(tmp_path), "--nominal", str(REAL), "--damage", "tip,edge,pit"]
+    options = ["--out", str(tmp_path), "--nominal", str(REAL), "--damage", "tip,edge,pit", "--views", "8"]
     assert main(options) == 0
     truth = json.loads((tmp_path / "truth.json").read_text())
     plan = tomllib.loads((tmp_path / "plan.toml").read_text())

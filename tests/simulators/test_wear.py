@@ -63,7 +63,7 @@ def test_a_warped_mesh_stays_closed_and_keeps_what_is_below() -> None:
 
 
 def test_the_airfoil_of_a_plain_blade_is_found_without_help() -> None:
-    airfoil = find_airfoil(NOMINAL.airfoil.solid)
+    airfoil = find_airfoil(blade_solid(BladeShape(), BladeShape().surface, around=240, along=106))
     assert airfoil.z_min_mm == pytest.approx(5.25, abs=0.01)
     assert airfoil.z_max_mm == 105.0
     frame = airfoil.frame(50.0)
