@@ -6,10 +6,11 @@ from math import isfinite
 import numpy as np
 
 from geometry.errors import BadInput, CannotMeasure
-from geometry.transforms import check_rigid, rigid
-from geometry.types import Floats
+from geometry.transforms import about_z, apply, check_rigid, inverse, rigid
+from geometry.types import Floats, Ints
 
 MIN_TURN_DEG = 90.0  # of arc that the sphere must see for its circle to be known
+MIN_CHECK_DEG = 180.0  # of arc round which a ball must be seen for its place to prove the axis
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,6 +30,14 @@ class AxisCalibration:
         sigmas = (self.sigma_offset_mm, self.sigma_tilt_deg)
         if not all(isfinite(s) and s >= 0.0 for s in sigmas):
             raise BadInput(f"axis calibration: uncertainties {sigmas} are not numbers >= 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BallPlaces:
+    """Mean centre of each ball in the table frame, and the largest distance of a single view from it."""
+
+    places_mm: Floats  # (balls, 3)
+    stray_mm: float
 
 
 def calibrate_axis(sphere_centres_mm: Floats, angles_deg: Floats) -> AxisCalibration:
@@ -55,6 +64,31 @@ def calibrate_axis(sphere_centres_mm: Floats, angles_deg: Floats) -> AxisCalibra
         sigma_offset_mm=float(offset_mm),
         sigma_tilt_deg=float(np.rad2deg(circle_mm / radius_mm)),
     )
+
+
+def ball_places(axis: AxisCalibration, centres_mm: Floats, angles_deg: Floats, ball: Ints) -> BallPlaces:
+    """Where each ball of an artefact on the table comes to lie in the table frame, and how far it strays.
+
+    `centres_mm` (k, 3), scanner frame, of ball number `ball` (k,) at table angle `angles_deg` (k,). A ball
+    stays where it is only if axis, angles and scanner are right; after VDI/VDE 2634-3, multi-view. Raises
+    `CannotMeasure` unless each ball was seen round half a turn.
+    """
+    table_mm = np.array(
+        [
+            apply(inverse(axis.T_scanner_table0 @ about_z(a)), x[None])[0]
+            for a, x in zip(angles_deg, centres_mm, strict=True)
+        ]
+    )
+    numbers = np.unique(ball)
+    for number in numbers:
+        if not _spread_deg(angles_deg[ball == number]) >= MIN_CHECK_DEG:
+            raise CannotMeasure(f"ball {number}: not seen round {MIN_CHECK_DEG:g} deg of the table")
+    means_mm = np.array([table_mm[ball == number].mean(axis=0) for number in numbers])
+    strays_mm = [
+        np.linalg.norm(table_mm[ball == n] - mean, axis=1).max()
+        for n, mean in zip(numbers, means_mm, strict=True)
+    ]
+    return BallPlaces(places_mm=means_mm, stray_mm=float(max(strays_mm)))
 
 
 def find_sphere(points_mm: Floats, radius_mm: float) -> tuple[Floats, float]:

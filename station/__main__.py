@@ -152,17 +152,31 @@ def become(module: str, *arguments: str) -> None:
 @app.command()
 def calibrate(
     *,
-    spheres: Annotated[Path, typer.Option(metavar="FILE.csv", help="Rows: angle_deg, x, y, z of a sphere.")],
-    out: Annotated[Path, typer.Option(metavar="FILE.toml", help="The calibration to write.")],
-    scanner_serial: Annotated[int, typer.Option(min=0, help="Of the scanner that saw the sphere.")],
+    spheres: Annotated[
+        Path, typer.Option(metavar="FILE.csv", help="Rows: angle_deg, x, y, z of a ball's centre [, ball].")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE.toml", help="The calibration or check to write.")],
+    scanner_serial: Annotated[
+        int | None, typer.Option(min=0, help="Of the scanner that saw the ball, for a new calibration.")
+    ] = None,
+    check: Annotated[
+        Path | None, typer.Option(metavar="CALIBRATION.toml", help="Check this one with a ball bar instead.")
+    ] = None,
+    bar_mm: Annotated[float, typer.Option(min=0.0, help="Certified distance of the bar's two balls.")] = 0.0,
 ) -> None:
-    """The turntable's axis from the centres of a sphere that rides on it."""
+    """The turntable's axis from a ball that rides on it; or its daily check with a ball bar."""
     from datetime import UTC, datetime
 
     with bad_input_is_one_line():
-        from station.calibration import calibrate_from
+        from station.calibration import calibrate_from, check_from
 
-        line = calibrate_from(spheres, out, scanner_serial, datetime.now(UTC))
+        now = datetime.now(UTC)
+        if check is not None:
+            line = check_from(spheres, check, bar_mm, out, now)
+        elif scanner_serial is not None:
+            line = calibrate_from(spheres, out, scanner_serial, now)
+        else:
+            raise typer.BadParameter("give --scanner-serial, or --check for a daily check")
     sys.stdout.write(f"{line}\n")
 
 

@@ -60,6 +60,14 @@ class CalibrationChoice(Settings):
     max_age_days: Positive
 
 
+class DailyCheckChoice(Settings):
+    """A cell that is to be checked with a ball bar every day; without this table it is not."""
+
+    file: Text
+    max_age_h: Positive = 24.0
+    max_error_mm: Positive
+
+
 class Worker(Settings):
     timeout_s: Positive = 180.0
 
@@ -76,6 +84,7 @@ class StationConfig(Settings):
     record: Record
     events: Events = Events()
     calibration: CalibrationChoice
+    daily_check: DailyCheckChoice | None = None
     worker: Worker = Worker()
     recipes: Annotated[dict[RecipeNumber, Text], Field(min_length=1)]
     _path: Path = PrivateAttr(default=Path("station.toml"))
@@ -98,6 +107,11 @@ class StationConfig(Settings):
     def calibration_path(self) -> Path:
         """The calibration of the turntable axis in the scanner."""
         return self.beside(self.calibration.file)
+
+    @property
+    def daily_check_path(self) -> Path | None:
+        """The newest check with an artefact, or None where the cell needs none."""
+        return None if self.daily_check is None else self.beside(self.daily_check.file)
 
     def plan_path(self, recipe: int) -> Path | None:
         """The plan of a recipe number, or None when the cell does not know that number."""

@@ -16,6 +16,7 @@ from station import handshake as shaking
 from station.acquire import scan_part
 from station.attend import recorded, tick
 from station.cell import Cell, RecipeFile, utc_now
+from station.daily import daily_gate
 from station.events import StepFinished, StepStarted, VerdictReached
 from station.filing import file_part, show_part
 from station.gates import Gate, Gates
@@ -147,7 +148,7 @@ def check_gates(cell: Cell, recipe: RecipeFile, job: Job) -> Gates:
     right_scanner = cell.calibration.scanner_serial == cell.config.scanner.serial
     return Gates(
         calibration=Gate(holds=left_days >= 0.0 and right_scanner, reason="expired, or of another scanner"),
-        daily_check=Gate(holds=True),
+        daily_check=daily_gate(cell.config, datetime.now(UTC)),
         continuity=Gate(holds=not changed, reason=f"changed since the start: {', '.join(changed)}"),
         mode=Gate(holds=cell.working, reason=f"mode {cell.config.mode} gives no verdicts"),
     )

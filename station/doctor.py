@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from station.config import StationConfig, find_config, read_calibration, read_config
+from station.daily import daily_gate
 from station.plans import read_plan
 from station.recipe import axis_of, prepare_recipe
 
@@ -61,6 +62,7 @@ def examine_config(given: Path | None, now: datetime) -> Iterator[Check]:
         return
     config = read_config(find_config(given))
     yield tried(f"calibration {config.calibration_path}", partial(check_calibration, config, now))
+    yield tried("daily check", partial(check_daily, config, now))
     for number in config.recipes:
         yield tried(f"recipe {number}", partial(check_recipe, config, int(number)))
     yield tried(f"record {config.record_directory}", partial(check_writable, config.record_directory))
@@ -75,6 +77,13 @@ def check_calibration(config: StationConfig, now: datetime) -> None:
         raise ValueError(f"{age_days:.1f} days old, want 0 to {config.calibration.max_age_days:g}")
     if calibration.scanner_serial != config.scanner.serial:
         raise ValueError(f"is of scanner {calibration.scanner_serial}, not of {config.scanner.serial}")
+
+
+def check_daily(config: StationConfig, now: datetime) -> None:
+    """Raise why the daily check does not hold."""
+    gate = daily_gate(config, now)
+    if not gate.holds:
+        raise ValueError(gate.reason)
 
 
 def check_recipe(config: StationConfig, number: int) -> None:

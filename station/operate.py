@@ -17,6 +17,7 @@ from station.attend import attend, keep_answers, recorded, show_status, take_int
 from station.cell import WARM_S, Cell, RecipeFile, utc_now
 from station.chain import RecordFailed
 from station.cycle import LOAD_DEG, PartInterrupted, in_place, publish, run_part
+from station.daily import daily_gate
 from station.events import PartStarted
 from station.handshake import Phase
 from station.job import begin_job, close_unjudged, recover
@@ -112,6 +113,8 @@ def check_fit(cell: Cell) -> None:
         raise Unfit(134, "the calibration is of another scanner")
     if cell.calibration_left_days() < 0.0:
         raise Unfit(134, "the calibration has expired or lies in the future")
+    if not (daily := daily_gate(cell.config, datetime.now(UTC))).holds:
+        raise Unfit(134, f"the daily check: {daily.reason}")
     free_bytes = shutil.disk_usage(cell.config.record_directory).free
     if free_bytes < MIN_FREE_BYTES:
         raise Unfit(132, f"{free_bytes >> 20} MB free")
