@@ -25,6 +25,7 @@ from simulators.cell import (
 )
 from simulators.faults import Faults
 from simulators.plc import PlcProgram, run_plc
+from simulators.preset_names import PRESETS, preset_named
 from simulators.scanner import ScannerPorts, serve_scanner
 from simulators.serve import ByteServer, serve_pty, serve_tcp
 from simulators.station_files import Addresses, free_port, write_station
@@ -190,12 +191,19 @@ def _readable(addresses: Addresses) -> str:
     )
 
 
+def _preset(text: str) -> str:
+    try:
+        return preset_named(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m simulators", description=__doc__)
     serve = parser.add_subparsers(required=True).add_parser("serve", help="serve a cell until SIGTERM")
     add = serve.add_argument
     add("--seed", type=int, default=0, help="of parts, noise and rig")
-    add("--preset", default="demo", help="which parts come")
+    add("--preset", type=_preset, default="demo", help="which parts come: " + ", ".join(PRESETS))
     add("--nominal", type=Path, help="mesh file of the part number; default: the thesis blade")
     add("--json", action="store_true", help="print the addresses as one line of JSON")
     add("--write-config", type=Path, metavar="FILE", help="write a station configuration")

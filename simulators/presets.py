@@ -16,24 +16,22 @@ from simulators.blade import BladeShape, Wear, blade_solid
 from simulators.damage_solids import Cut, edge_nick, pit, tip_corner
 from simulators.optics import BlindSpot, OpticsSettings
 from simulators.parts import PEDESTAL_MM, SimPart, assemble, clamped
+from simulators.preset_names import DEMO, preset_named
 from simulators.recipe import write_plan
 from simulators.rig import Rig, rig_around
 from simulators.solids import Solid, read_solid
 from simulators.wear import NominalBlade, WornBlade, mesh_nominal, thesis_nominal, worn_blade
 
 __all__ = [
-    "PRESETS",
     "SimPart",
     "make_part",
     "nominal_blade",
     "part_for",
-    "preset_named",
     "rig_for",
     "rig_of",
     "write_recipe",
 ]
 
-DEMO = ("PASS", "REPAIR", "SCRAP")
 CLEARANCE_MM = 3.0  # round the part, for its play in the fixture
 PITCH_MM = 0.2  # of a pixel on the thesis' blade
 
@@ -77,14 +75,6 @@ def make_part(blade: NominalBlade, preset: str, seed: int, index: int = 0) -> Si
     optics = OpticsSettings(blind=(_dirt(blade, worn, rng),) if preset == "HOLD-hole" else ())
     cuts = CUTS[preset](blade, worn, rng) if preset in CUTS else []
     return assemble(blade, worn, cuts, preset=preset, serial=serial, seed=seed, optics=optics, rng=rng)
-
-
-def preset_named(text: str) -> str:
-    """The preset of that name in any case; "hold" alone is the part with a hole in its scan."""
-    names = {name.upper(): name for name in (*PRESETS, "demo")} | {"HOLD": "HOLD-hole"}
-    if text.upper() not in names:
-        raise ValueError(f"preset {text!r} is none of {', '.join(PRESETS)}, demo")
-    return names[text.upper()]
 
 
 def serial_of(seed: int, index: int) -> str:
@@ -149,7 +139,6 @@ CUTS: dict[str, CutMaker] = {
     "REPAIR": corner_and_pit,
     "SCRAP": beyond_repair,
 }
-PRESETS = ("PASS", *CUTS, "HOLD-hole", "HOLD-wrong-part")
 
 
 def _dirt(blade: NominalBlade, worn: WornBlade, rng: np.random.Generator) -> BlindSpot:

@@ -22,12 +22,11 @@ from simulators.blade import Wear
 from simulators.calibration_file import calibrated_axis
 from simulators.optics import OpticsSettings
 from simulators.parts import SimPart, assemble
+from simulators.preset_names import PRESETS, preset_named
 from simulators.presets import (
-    PRESETS,
     broken_corner,
     make_part,
     nominal_blade,
-    preset_named,
     repairable_nick,
     repairable_pit,
     rig_of,

@@ -12,12 +12,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from simulators.parts import SimPart
+from simulators.preset_names import PRESETS, preset_named
 from simulators.presets import (
-    PRESETS,
     make_part,
     nominal_blade,
     part_for,
-    preset_named,
     rig_for,
     write_recipe,
 )
