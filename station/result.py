@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geometry.types import Measurand, Measured, Mesh
+from station.formats.threemf import threemf
 from station.formats.write import ply_cloud, ply_mesh, stl
 from station.report import render
 from station.tables import sections_csv
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "bladecell.result/1"
 OURS = re.compile(
-    r"(result\.json|report\.html|deviation\.ply|twin\.ply|repair(-[1-9][0-9]*)?\.stl|sections\.csv)"
+    r"(result\.json|report\.html|deviation\.ply|twin\.ply|repair(-[1-9][0-9]*)?\.stl|repair\.3mf|sections\.csv)"
 )
 STEPS = ("read", "clean", "register", "sections", "damage", "twin", "repair", "total")
 
@@ -269,10 +270,13 @@ def surfaces(measurement: Measurement) -> dict[str, bytes]:
 
 
 def repair_files(patches: list[Patch]) -> dict[str, bytes]:
-    """Each patch as a file, and all of them as one."""
+    """Each patch as a file, and all of them as one of each format."""
     meshes: list[Mesh] = [patch.mesh for patch in patches]
     files = {f"repair-{number}.stl": stl([mesh]) for number, mesh in enumerate(meshes, 1)}
-    return files | ({"repair.stl": stl(meshes)} if meshes else {})
+    if not meshes:
+        return files
+    named = {f"repair-{number} {patch.zone}": patch.mesh for number, patch in enumerate(patches, 1)}
+    return files | {"repair.stl": stl(meshes), "repair.3mf": threemf(named)}
 
 
 def replace_files(folder: Path, files: Mapping[str, bytes]) -> None:

@@ -17,6 +17,7 @@ from station.formats.malformed import Malformed
 from station.formats.pcd import pcd_points
 from station.formats.ply import ply_points
 from station.formats.text import text_points
+from station.formats.threemf import threemf
 from station.formats.write import ply_cloud, ply_mesh, stl
 from tests.station.parts import tetrahedron
 
@@ -391,6 +392,18 @@ def test_a_mesh_that_would_open_is_refused() -> None:
     mesh = tetrahedron()
     with pytest.raises(ValueError, match="does not stay closed"):
         stl([Mesh(vertices_mm=mesh.vertices_mm, faces=mesh.faces[:3])])
+
+
+def test_3mf_has_named_solids_in_millimetres_for_others() -> None:
+    box = trimesh.creation.icosphere(subdivisions=2)
+    mesh = Mesh(vertices_mm=np.array(box.vertices) + 100.0, faces=np.array(box.faces, np.int64))
+    content = threemf({"repair-1 tip": mesh, "a & <b>": tetrahedron()})
+    again = trimesh.load(io.BytesIO(content), file_type="3mf")
+    assert again.units == "millimeter"
+    assert set(again.geometry) == {"repair-1 tip", "a & <b>"}
+    assert again.geometry["repair-1 tip"].is_watertight
+    assert again.geometry["repair-1 tip"].volume == pytest.approx(box.volume, rel=1e-6)
+    assert content == threemf({"repair-1 tip": mesh, "a & <b>": tetrahedron()})
 
 
 def test_several_meshes_make_one_file() -> None:

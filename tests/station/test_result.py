@@ -213,7 +213,7 @@ def test_a_repair_has_all_its_files(tmp_path: Path) -> None:
         damages=(damage(), damage(Zone.SURFACE, depth=1.0)), repairs=repairs(patch(0), patch(1))
     )
     inspected(tmp_path / "out", two)
-    assert names(tmp_path / "out") == ALWAYS | {"repair.stl", "repair-1.stl", "repair-2.stl"}
+    assert names(tmp_path / "out") == ALWAYS | {"repair.stl", "repair.3mf", "repair-1.stl", "repair-2.stl"}
     for name in ("repair-1.stl", "repair-2.stl"):
         assert trimesh.load_mesh(tmp_path / "out" / name).is_watertight
     assert trimesh.load_mesh(tmp_path / "out" / "twin.ply").is_watertight
@@ -225,7 +225,7 @@ def test_our_own_files_are_replaced_and_foreign_ones_are_not(tmp_path: Path) -> 
     for name in ("notes.txt", "repair-0.stl", "repair-x.stl", "my-result.json"):
         (tmp_path / name).write_text("foreign")
     foreign = {"notes.txt", "repair-0.stl", "repair-x.stl", "my-result.json"}
-    assert names(tmp_path) == ALWAYS | {"repair.stl", "repair-1.stl"} | foreign
+    assert names(tmp_path) == ALWAYS | {"repair.stl", "repair.3mf", "repair-1.stl"} | foreign
     inspected(tmp_path, measurement())
     assert names(tmp_path) == ALWAYS | foreign
     assert json.loads((tmp_path / "result.json").read_text())["verdict"] == "PASS"
@@ -261,7 +261,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
     monkeypatch.undo()
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.name in before} == before
     inspected(tmp_path, broken())  # what the failure left is no obstacle
-    assert names(tmp_path) == ALWAYS | {"repair.stl", "repair-1.stl"}
+    assert names(tmp_path) == ALWAYS | {"repair.stl", "repair.3mf", "repair-1.stl"}
 
 
 def test_a_link_is_not_followed(tmp_path: Path) -> None:
