@@ -5,8 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
+from geometry.errors import BadInput
+from geometry.transforms import check_rigid
 from geometry.types import Zone
 from station.tomlfile import BadFile, Number, Positive, Settings, Text, read_settings
 
@@ -21,6 +24,7 @@ SectionKey = Literal[
     "le_radius_mm",
     "te_radius_mm",
 ]
+Row = tuple[Number, Number, Number, Number]
 DamageZone = Literal["tip", "leading_edge", "trailing_edge", "surface"]
 
 
@@ -73,14 +77,25 @@ class Zones(Settings):
     edge_mm: Positive = 3.0
 
 
+Point = tuple[Number, Number, Number]
+
+
 class AlignmentChoice(Settings):
-    method: Literal["airfoil", "root", "six_point"] = "airfoil"
+    """What the scan is aligned by: the whole airfoil, a datum zone, six datum points, or some sections.
+
+    `datum_z_mm` beside another method than "root" asks for the root fit too, and for the bend and twist
+    in service that the difference of the two shows."""
+
+    method: Literal["airfoil", "root", "six_point", "sections"] = "airfoil"
     datum_z_mm: tuple[Number, Number] | None = None
+    points_mm: Annotated[tuple[Point, ...], Field(min_length=6, max_length=6)] | None = None
+    z_mm: Annotated[tuple[Number, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
-    def root_has_a_datum(self) -> Self:
-        if self.method == "root" and self.datum_z_mm is None:
-            raise ValueError('method = "root" needs datum_z_mm')
+    def method_has_its_datum(self) -> Self:
+        needed = {"root": "datum_z_mm", "six_point": "points_mm", "sections": "z_mm"}.get(self.method)
+        if needed and getattr(self, needed) is None:
+            raise ValueError(f'method = "{self.method}" needs {needed}')
         if self.datum_z_mm is not None and self.datum_z_mm[1] <= self.datum_z_mm[0]:
             raise ValueError("datum_z_mm must be [lower, upper]")
         return self
@@ -189,7 +204,22 @@ class Limits(Settings):
 
 
 class Repair(Settings):
+    """`frames`: where the patches are wanted beside the nominal's own frame, each as a file of its own."""
+
     allowance_mm: Annotated[Number, Field(ge=0.0)] = 0.0
+    frames: tuple[Literal["scan", "fixture"], ...] = ()
+    T_fixture_scan: tuple[Row, Row, Row, Row] | None = None
+
+    @model_validator(mode="after")
+    def fixture_is_known(self) -> Self:
+        if "fixture" in self.frames and self.T_fixture_scan is None:
+            raise ValueError('frames with "fixture" need T_fixture_scan')
+        if self.T_fixture_scan is not None:
+            try:
+                check_rigid(np.array(self.T_fixture_scan), "T_fixture_scan")
+            except BadInput as error:
+                raise ValueError(str(error)) from error
+        return self
 
 
 class Scan(Settings):
@@ -274,6 +304,7 @@ def heights(plan: BladePlan) -> list[tuple[str, float]]:
     named = [("airfoil.z_min_mm", plan.airfoil.z_min_mm), ("airfoil.z_max_mm", plan.airfoil.z_max_mm)]
     datum_mm = plan.alignment.datum_z_mm if plan.alignment.method == "root" else None
     datum = [("alignment.datum_z_mm", z_mm) for z_mm in datum_mm or ()]
+    datum += [("alignment.z_mm", z_mm) for z_mm in plan.alignment.z_mm or ()]
     return [(where, z_mm) for where, z_mm in named if z_mm is not None] + datum
 
 

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geometry.types import Measurand, Measured, Mesh
+from geometry.transforms import apply, inverse
+from geometry.types import Floats, Measurand, Measured, Mesh
 from station.formats.threemf import threemf
 from station.formats.write import ply_cloud, ply_mesh, stl
 from station.report import render
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "bladecell.result/1"
 OURS = re.compile(
-    r"(result\.json|report\.html|deviation\.ply|twin\.ply|repair(-[1-9][0-9]*)?\.stl|repair\.3mf|sections\.csv)"
+    r"(result\.json|report\.html|deviation\.ply|twin\.ply|repair(-([1-9][0-9]*|scan|fixture))?\.stl|repair\.3mf|sections\.csv)"
 )
 STEPS = ("read", "clean", "register", "sections", "damage", "twin", "repair", "total")
 
@@ -251,6 +252,7 @@ def write_inspection(
     files = {
         **surfaces(measurement),
         **repair_files(patches_of(measurement, verdict)),
+        **framed_files(measurement, verdict, plan),
         "sections.csv": sections_csv(measurement, verdict).encode(),
         "report.html": render(result, measurement, verdict, plan).encode(),
         "result.json": document_text(result).encode(),
@@ -277,6 +279,25 @@ def repair_files(patches: list[Patch]) -> dict[str, bytes]:
         return files
     named = {f"repair-{number} {patch.zone}": patch.mesh for number, patch in enumerate(patches, 1)}
     return files | {"repair.stl": stl(meshes), "repair.3mf": threemf(named)}
+
+
+def framed_files(measurement: Measurement, verdict: Verdict, plan: BladePlan) -> dict[str, bytes]:
+    """All patches in each further frame that the plan wants."""
+    patches = patches_of(measurement, verdict)
+    if not patches or measurement.alignment is None:
+        return {}
+    T_scan_nominal = inverse(measurement.alignment.T_nominal_scan)
+    T_fixture_scan = np.eye(4) if plan.repair.T_fixture_scan is None else np.array(plan.repair.T_fixture_scan)
+    frames = {"scan": T_scan_nominal, "fixture": T_fixture_scan @ T_scan_nominal}
+    return {
+        f"repair-{frame}.stl": stl([moved(patch.mesh, frames[frame]) for patch in patches])
+        for frame in plan.repair.frames
+    }
+
+
+def moved(mesh: Mesh, T: Floats) -> Mesh:
+    """The mesh in another frame."""
+    return Mesh(vertices_mm=apply(T, mesh.vertices_mm), faces=mesh.faces)
 
 
 def replace_files(folder: Path, files: Mapping[str, bytes]) -> None:

@@ -117,7 +117,7 @@ def test_a_plan_crosses_to_another_process(folder: Path) -> None:
         ("98.0]", "nan]", "sections.z_mm.2: Input should be a finite number"),
         ('"52.50"', '"52.51"', 'limits.section."52.51": no such section in [sections] z_mm'),
         ('"52.50"', '"nan"', "limits.section.nan: unknown key"),
-        ('"airfoil"', '"magic"', "alignment.method: Input should be 'airfoil', 'root' or 'six_point'"),
+        ('"airfoil"', '"magic"', "alignment.method: Input should be 'airfoil', 'root', 'six_point' or"),
         ("[0.0, 20.0]", "[20.0, 0.0]", "alignment: datum_z_mm must be [lower, upper]"),
         ("nominal.stl", "../nominal.stl", "nominal: '../nominal.stl' lies outside the folder of the plan"),
         ("nominal.stl", "/etc/passwd", "nominal: '/etc/passwd' lies outside the folder of the plan"),
@@ -139,9 +139,29 @@ def test_two_spellings_of_one_section_are_refused(folder: Path) -> None:
     assert fault(folder, twice) == 'limits.section: "5.25e1" stands twice'
 
 
-def test_root_alignment_needs_its_datum(folder: Path) -> None:
-    without = PLAN.replace('"airfoil"', '"root"').replace("datum_z_mm = [0.0, 20.0]\n", "")
-    assert fault(folder, without) == 'alignment: method = "root" needs datum_z_mm'
+@pytest.mark.parametrize(
+    ("method", "datum"), [("root", "datum_z_mm"), ("six_point", "points_mm"), ("sections", "z_mm")]
+)
+def test_each_alignment_needs_its_datum(folder: Path, method: str, datum: str) -> None:
+    without = PLAN.replace('"airfoil"', f'"{method}"').replace("datum_z_mm = [0.0, 20.0]\n", "")
+    assert fault(folder, without) == f'alignment: method = "{method}" needs {datum}'
+
+
+def test_six_points_are_six(folder: Path) -> None:
+    five = PLAN.replace('"airfoil"', '"six_point"\npoints_mm = [[0,0,0],[1,0,0],[2,0,0],[0,1,0],[0,2,0]]')
+    assert fault(folder, five).startswith("alignment.points_mm: Tuple should have at least 6 items")
+
+
+@pytest.mark.parametrize(
+    ("table", "what"),
+    [
+        ('frames = ["fixture"]', 'repair: frames with "fixture" need T_fixture_scan'),
+        ('frames = ["table"]', "repair.frames.0: Input should be 'scan' or 'fixture'"),
+        ("T_fixture_scan = [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "repair: T_fixture_scan"),
+    ],
+)
+def test_a_frame_that_is_not_known_is_refused(folder: Path, table: str, what: str) -> None:
+    assert fault(folder, f"{PLAN}\n[repair]\n{table}\n").startswith(what)
 
 
 HEAD = PLAN[: PLAN.index("[limits.section]")]

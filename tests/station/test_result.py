@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from geometry.transforms import about_z, apply, rigid
 from geometry.types import Zone
 from station.gates import Gate
 from station.measurement import Measurement
@@ -218,6 +219,24 @@ def test_a_repair_has_all_its_files(tmp_path: Path) -> None:
         assert trimesh.load_mesh(tmp_path / "out" / name).is_watertight
     assert trimesh.load_mesh(tmp_path / "out" / "twin.ply").is_watertight
     assert len(trimesh.load(tmp_path / "out" / "deviation.ply").vertices) == 200
+
+
+def test_patches_come_in_the_frames_that_the_plan_wants(tmp_path: Path) -> None:
+    T_nominal_scan = rigid(about_z(30.0)[:3, :3], np.array([1.0, -2.0, 50.0]))
+    given = measurement(
+        alignment=alignment(T_nominal_scan=T_nominal_scan), damages=(damage(),), repairs=repairs(patch(0))
+    )
+    T_fixture_scan = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 12.0]))
+    wanted = plan(repair={"frames": ["scan", "fixture"], "T_fixture_scan": T_fixture_scan.tolist()})
+    write_inspection(tmp_path, given, judge(given, wanted, GATES), wanted, INPUTS)
+    nominal, scan, fixture = (
+        np.asarray(trimesh.load_mesh(tmp_path / f"repair{frame}.stl").triangles).reshape(-1, 3)
+        for frame in ("", "-scan", "-fixture")
+    )
+    np.testing.assert_allclose(apply(T_nominal_scan, scan), nominal, atol=1e-4)
+    np.testing.assert_allclose(apply(T_fixture_scan, scan), fixture, atol=1e-4)
+    inspected(tmp_path, given)
+    assert names(tmp_path) == ALWAYS | {"repair.stl", "repair.3mf", "repair-1.stl"}
 
 
 def test_our_own_files_are_replaced_and_foreign_ones_are_not(tmp_path: Path) -> None:
