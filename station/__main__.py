@@ -102,7 +102,7 @@ def inspect(
 
         done = inspect_scan(plan, scan, out, serial=serial, clock=time.perf_counter, progress=progress)
     if json:
-        from station.result import document_text
+        from station.document import document_text
 
         sys.stdout.write(document_text(done.result))
     else:

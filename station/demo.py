@@ -94,8 +94,8 @@ async def run_until_done(config: Path, score: Score) -> None:
     from station.cell import open_cell
     from station.config import read_config
     from station.operate import run_forever
-    from station.result import software_version
     from station.run import leave_on_signals
+    from station.software import software_version
 
     def hear(event: Event) -> None:
         score.hear(event)

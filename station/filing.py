@@ -30,7 +30,8 @@ def file_part(
 ) -> None:
     """Writes the files of an inspection into `folder`. `frames`: the frames.json of the raw captures; its
     digest stands for the scan, for it holds the digest of each of them."""
-    from station.result import Inputs, write_inspection
+    from station.document import Inputs
+    from station.result import write_inspection
 
     inputs = Inputs(
         serial=ticket.serial,

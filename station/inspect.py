@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from station.clouds import Scan, read_scan
+from station.document import Inputs
 from station.gates import Gate, Gates
 from station.measure import Clock, Progress, as_cloud, measure_cloud
 from station.plans import read_plan
 from station.recipe import Recipe, prepare_recipe
 from station.refusal import BadRequest
-from station.result import Inputs, write_inspection
+from station.result import write_inspection
 from station.verdict import Verdict, judge
 
 MAX_SERIAL = 64

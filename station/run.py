@@ -18,7 +18,7 @@ from station.config import find_config, read_config
 from station.console import print_line
 from station.events import Event
 from station.operate import run_forever
-from station.result import software_version
+from station.software import software_version
 from station.tomlfile import BadFile
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2

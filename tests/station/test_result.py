@@ -16,10 +16,12 @@ import trimesh
 
 from geometry.transforms import about_z, apply, rigid
 from geometry.types import Zone
+from station.document import Inputs, document, document_text
 from station.gates import Gate
 from station.measurement import Measurement
 from station.report import fixed, render
-from station.result import Inputs, document, document_text, replace_files, software_commit, write_inspection
+from station.result import replace_files, write_inspection
+from station.software import software_commit
 from station.tables import COLUMNS, sections_csv
 from station.verdict import Word, judge
 from tests.station.parts import (
