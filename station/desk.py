@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from geometry.transforms import about_z, apply
-from geometry.types import View
+from geometry.types import Floats, View
 from station.config import read_calibration
 from station.measure import Progress, Views, absorb, conclude
 from station.measurement import Measurement
@@ -16,7 +16,8 @@ from station.plans import read_plan
 from station.recipe import Recipe, axis_of, prepare_recipe
 
 REHEARSED_ANGLES_DEG = (0.0, 180.0)
-REHEARSED_POINTS = 5_000  # of a view: enough for every step, few enough to be quick
+REHEARSED_POINTS = 10_000  # enough for every step, few enough to be quick
+DENT_RADIUS_MM, DENT_MM = 4.0, 1.0  # what is to be repaired at the rehearsal
 
 
 class GeometryDesk:
@@ -58,16 +59,25 @@ def make_desk(plans: Mapping[int, Path], calibration: Path) -> GeometryDesk:
 
 
 def rehearse(desk: GeometryDesk, number: int, recipe: Recipe) -> None:
-    """Measures the nominal itself once, so that every kernel is compiled before the first part comes."""
+    """Measures the nominal with a dent once, so that every kernel is compiled before the first part comes."""
     assert recipe.axis is not None
-    rng, sigma_mm = np.random.default_rng(0), recipe.plan.measurement.sigma_mm
-    step = -(-len(recipe.nominal.samples.points_mm) // REHEARSED_POINTS)
+    points_mm = rehearsed_mm(recipe)
     desk.begin(number)
     for index, angle_deg in enumerate(REHEARSED_ANGLES_DEG):
-        points_mm = recipe.nominal.samples.points_mm[index::step]
-        noise_mm = rng.normal(0.0, sigma_mm, (len(points_mm), 1))
-        points_mm = points_mm + noise_mm * recipe.nominal.samples.normals[index::step]
         T_scanner_table = recipe.axis.T_scanner_table0 @ about_z(angle_deg)
-        desk.absorb(View(index=index, angle_deg=angle_deg, points_mm=apply(T_scanner_table, points_mm)))
+        seen_mm = apply(T_scanner_table, points_mm[index :: len(REHEARSED_ANGLES_DEG)])
+        desk.absorb(View(index=index, angle_deg=angle_deg, points_mm=seen_mm))
     desk.conclude(lambda step: None)
     desk.begin(number)
+
+
+def rehearsed_mm(recipe: Recipe) -> Floats:
+    """Points (n, 3) of the nominal, nominal frame, with noise and a dent."""
+    samples, sigma_mm = recipe.nominal.samples, recipe.plan.measurement.sigma_mm
+    few = slice(None, None, -(-len(samples.points_mm) // REHEARSED_POINTS))
+    points_mm, normals = samples.points_mm[few], samples.normals[few]
+    off_mm = np.random.default_rng(0).normal(0.0, sigma_mm, len(points_mm))
+    away_mm = np.linalg.norm(points_mm - points_mm[len(points_mm) // 2], axis=1)
+    dented = (away_mm < DENT_RADIUS_MM) & (normals @ normals[len(points_mm) // 2] > 0.5)
+    off_mm[dented] -= DENT_MM
+    return np.asarray(points_mm + off_mm[:, None] * normals)
