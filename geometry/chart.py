@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,6 +19,31 @@ from geometry.types import Bools, Floats, Ints
 
 NODES = 2048  # of a profile; half on each side between the edges
 _TUKEY = 4.685  # standard deviations; 95 % efficient on Gaussian residuals
+
+
+Freedom = Literal["x", "y", "rotation"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitSettings:
+    """How a section is best fitted to its nominal: what each side weighs, and what must not move."""
+
+    le: float = 1.0
+    suction: float = 1.0
+    te: float = 1.0
+    pressure: float = 1.0
+    locked: frozenset[Freedom] = frozenset()
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.weights).all() and (self.weights >= 0.0).all() and self.weights.any()):
+            raise BadInput("section fit: a weight is not a number >= 0, or all are 0")
+        if not self.locked <= {"x", "y", "rotation"}:
+            raise BadInput("section fit: only x, y and rotation can be locked")
+
+    @property
+    def weights(self) -> Floats:
+        """By side, as `NominalSection.side` numbers them."""
+        return np.array([self.le, self.suction, self.te, self.pressure])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,11 +65,19 @@ class SectionSettings:
     outlier: float = 5.0  # standard deviations
     damage_reach_mm: float = 25.0  # along z: how far from a gap its damaged border is looked for
     min_points: int = 60
+    tolerance_mm: float = 0.1  # of the profile: the share of the arc that is farther off is reported
+    edge_distances_mm: tuple[float, ...] = (2.0, 4.0)  # from each edge: where its thickness is taken
+    flat_mm: float = 0.005  # what bulges less than this over its chord is a flat of an edge
+    wave_mm: tuple[float, float] = (2.5, 15.0)  # wavelengths that are waviness
+    fit: FitSettings = FitSettings()
 
     def __post_init__(self) -> None:
         lengths = (self.max_gap_mm, self.band_mm, self.layer_mm, self.knot_mm, self.edge_mm, self.z_knot_mm)
-        if not all(np.isfinite(x) and x > 0.0 for x in (*lengths, self.capture_mm, self.outlier)):
+        asked = (self.tolerance_mm, *self.edge_distances_mm, self.flat_mm, *self.wave_mm)
+        if not all(np.isfinite(x) and x > 0.0 for x in (*lengths, *asked, self.capture_mm, self.outlier)):
             raise BadInput("section settings: a length is not a positive number")
+        if not self.wave_mm[0] < self.wave_mm[1]:
+            raise BadInput("section settings: the shortest wave is not shorter than the longest")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from geometry.chart import outward_normals
 from geometry.errors import CannotMeasure
-from geometry.kernels.airfoil import farthest_pair, inscribed_circles
+from geometry.kernels.airfoil import inscribed_circles
 from geometry.types import Floats, Ints
 
 
@@ -29,6 +29,12 @@ def node_shares(curve_mm: Floats) -> Floats:
     after = np.linalg.norm(np.roll(curve_mm, -1, axis=0) - curve_mm, axis=1)
     shares: Floats = 0.5 * (after + np.roll(after, 1))
     return shares
+
+
+def node_arc(curve_mm: Floats) -> Floats:
+    """Arc length (m,) at which each node of a closed curve stands, from node 0."""
+    step = np.linalg.norm(np.diff(curve_mm, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(step)])
 
 
 def area(curve_mm: Floats) -> float:
@@ -86,6 +92,16 @@ class Edge:
 
     zone: Ints  # contiguous, in order, within 8 % of the perimeter from the edge point
     arc: Ints  # of these, where the normal lies within 60 deg of the edge's own direction
+    flank: tuple[int, int]  # on the two sides, 4 % of the perimeter away; their normals give the direction
+
+    def direction(self, curve_mm: Floats) -> Floats:
+        """The unit direction (2,) in which the edge of a curve points: halfway between its flanks."""
+        one, other = self.flank
+        normals = outward_normals(curve_mm)
+        apart = normals[one] - normals[other]
+        halfway = np.array([apart[1], -apart[0]]) / np.linalg.norm(apart)
+        outward = 2.0 * curve_mm[self.zone[len(self.zone) // 2]] - curve_mm[one] - curve_mm[other]
+        return halfway if float(halfway @ outward) > 0.0 else -halfway
 
 
 def edge(nominal_mm: Floats, tip: int) -> Edge:
@@ -95,15 +111,16 @@ def edge(nominal_mm: Floats, tip: int) -> Edge:
     """
     m = len(nominal_mm)
     share = node_shares(nominal_mm)
-    arc = np.cumsum(share) - share
-    away = (arc - arc[tip] + 0.5 * share.sum()) % share.sum() - 0.5 * share.sum()
+    place = np.cumsum(share) - share
+    away = (place - place[tip] + 0.5 * share.sum()) % share.sum() - 0.5 * share.sum()
     order = (tip + np.arange(-m // 2, m // 2)) % m
     zone = order[np.abs(away[order]) <= 0.08 * share.sum()]
     normals = outward_normals(nominal_mm)[zone]
     angle = np.unwrap(np.arctan2(normals[:, 1], normals[:, 0]))
-    flank = np.abs(away[zone]) <= 0.04 * share.sum()
-    middle = 0.5 * (angle[flank][0] + angle[flank][-1])
-    return Edge(zone=zone, arc=zone[np.abs(angle - middle) <= np.deg2rad(60.0)])
+    first, *_, last = np.flatnonzero(np.abs(away[zone]) <= 0.04 * share.sum())
+    middle = 0.5 * (angle[first] + angle[last])
+    arc = zone[np.abs(angle - middle) <= np.deg2rad(60.0)]
+    return Edge(zone=zone, arc=arc, flank=(int(zone[first]), int(zone[last])))
 
 
 def edge_radius(curve_mm: Floats, arc: Ints) -> Estimate:
@@ -135,70 +152,6 @@ def edge_radius(curve_mm: Floats, arc: Ints) -> Estimate:
     gradient = np.zeros(len(curve_mm))
     gradient[arc] = pull[0]
     return Estimate(value=radius + float(step[0]), gradient=gradient)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Contact:
-    """Where a line across `direction` touches an edge from outside."""
-
-    point_mm: Floats
-    radius_mm: float  # of curvature
-    slope: Floats  # (m,): weights that give the slope of a node function along the arc there
-
-
-def _touch(curve_mm: Floats, node: int, direction: Floats) -> Contact:
-    """The contact near `node`, between nodes, by a parabola through 17 of them."""
-    m = len(curve_mm)
-    near = (node + np.arange(-8, 9)) % m
-    points = curve_mm[near]
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    arc -= arc[8]
-    inverse = np.linalg.pinv(np.vander(arc, 3, increasing=True))
-    _, linear, square = inverse @ (points @ direction)
-    curvature = -2.0 * float(square)
-    reach = float(arc[-1])
-    at = float(np.clip(linear / curvature, arc[0], reach)) if curvature > 1e-9 else 0.0
-    place = np.array([1.0, at, at * at]) @ inverse @ points
-    slope = np.zeros(m)
-    slope[near] = inverse[1] + 2.0 * at * inverse[2]
-    return Contact(point_mm=place, radius_mm=1.0 / max(curvature, 1.0 / 50.0), slope=slope)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Chord:
-    """Length (mm) and stagger (rad, of the line nose to tail against +X) of a section."""
-
-    length: Estimate
-    stagger: Estimate
-    nose_mm: Floats
-    tail_mm: Floats
-
-
-def chord(curve_mm: Floats, le: Edge, te: Edge) -> Chord:
-    """The caliper chord: the largest distance between two points of the section (largest Feret diameter).
-
-    Its ends lie in the zones of the two edges; the nose is the one at the leading edge.
-    """
-    nose, tail = farthest_pair(curve_mm, le.zone, te.zone)
-    ends = curve_mm[tail] - curve_mm[nose]
-    for _ in range(4):
-        along = ends / np.linalg.norm(ends)
-        front, back = _touch(curve_mm, nose, -along), _touch(curve_mm, tail, along)
-        ends = back.point_mm - front.point_mm
-    length = float(np.linalg.norm(ends))
-    normals = outward_normals(curve_mm)
-    gradient = np.zeros(len(curve_mm))
-    gradient[nose] = -float(normals[nose] @ along)
-    gradient[tail] = float(normals[tail] @ along)
-    lever = length - front.radius_mm - back.radius_mm
-    swing = (back.radius_mm * back.slope + front.radius_mm * front.slope) / lever
-    angle = float(np.arctan2(ends[1], ends[0]))
-    return Chord(
-        length=Estimate(value=length, gradient=gradient),
-        stagger=Estimate(value=angle, gradient=swing),
-        nose_mm=front.point_mm,
-        tail_mm=back.point_mm,
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -34,7 +34,7 @@ from geometry.kernels.profile_spline import (
     solve,
 )
 from geometry.nominal import Nominal
-from geometry.types import Bools, Floats
+from geometry.types import Bools, Floats, Ints
 
 _PILOT_POINTS = 20_000  # of a band, to tell outliers
 _BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # a start: curvature of sides, of edges, along the span
@@ -103,6 +103,14 @@ class Gap:
     in_damage: bool  # damaged points border it: metal lost or bent there, and seen to be
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZoneArc:
+    """How much of one side has points: the part outside gaps, and the widest stretch without a point."""
+
+    covered_fraction: float
+    largest_gap_mm: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Profile:
     """The reconstructed section: NODES nodes that correspond to those of the chart's nominal curve."""
@@ -111,6 +119,7 @@ class Profile:
     curve_mm: Floats  # (NODES, 2) nominal frame; inside a gap it is no measurement
     deviation_mm: Floats  # (NODES,) signed distance to the nominal section, positive outside
     gaps: tuple[Gap, ...]
+    zones: tuple[ZoneArc, ...]  # of each side
     noise_mm: float  # standard deviation of a typical point about the profile, in the plane
     knots: Knots
     fit: SplineFit
@@ -194,8 +203,12 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     keep, fit = _robust_fit(band, knots, _penalty(chart, knots, settings), settings)
     near = np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0
     arc = _supporting(chart.arc_at(band.node[near]), keep[near], settings.max_gap_mm)
-    gaps = find_gaps(chart, arc, settings.max_gap_mm)
-    return _profile(chart, motion, knots, fit, gaps, float(np.median(band.sigma_mm)))
+    profile = _profile(chart, motion, knots, fit, float(np.median(band.sigma_mm)))
+    return replace(
+        profile,
+        gaps=find_gaps(chart, arc, settings.max_gap_mm),
+        zones=cover_zones(chart.curve_mm, chart.side, arc, settings.max_gap_mm),
+    )
 
 
 def _onto_chart(
@@ -236,10 +249,8 @@ def _robust_fit(
     return keep, fit_spline(band.sums(keep, knots, penalty), penalty, start)
 
 
-def _profile(
-    chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, gaps: tuple[Gap, ...], sigma_mm: float
-) -> Profile:
-    """The curve of a fit, taken back to where the part is."""
+def _profile(chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, sigma_mm: float) -> Profile:
+    """The curve of a fit, taken back to where the part is; its gaps are not known yet."""
     normals = outward_normals(chart.curve_mm)
     columns = rigid_columns(chart.curve_mm, normals, motion.pivot_mm, np.zeros(NODES))
     height = np.full(NODES, chart.section_z_mm)
@@ -249,7 +260,8 @@ def _profile(
         chart=chart,
         curve_mm=curve,
         deviation_mm=chart.project(np.column_stack([curve, height]))[:, 1],
-        gaps=gaps,
+        gaps=(),
+        zones=(),
         noise_mm=float(np.sqrt(fit.scale)) * sigma_mm,
         knots=knots,
         fit=fit,
@@ -282,6 +294,24 @@ def find_gaps(chart: Chart, arc_mm: Floats, max_gap_mm: float) -> tuple[Gap, ...
     width = np.diff(arc, append=arc[0] + chart.perimeter_mm)
     wide = np.flatnonzero(~(width <= max_gap_mm))
     return tuple(Gap(start_mm=float(arc[i]), width_mm=float(width[i]), in_damage=False) for i in wide)
+
+
+def cover_zones(curve_mm: Floats, side: Ints, arc_mm: Floats, max_gap_mm: float) -> tuple[ZoneArc, ...]:
+    """How each side (0 .. 3) of a curve is covered by points at `arc_mm` (n,), as `find_gaps` counts it."""
+    step = np.linalg.norm(np.roll(curve_mm, -1, axis=0) - curve_mm, axis=1)
+    ends = np.concatenate([[0.0], np.cumsum(step)])
+    arc = np.sort(arc_mm)
+    width = np.diff(arc, append=arc[:1] + ends[-1])
+    zones = []
+    for index in range(4):
+        inside = np.concatenate([[0.0], np.cumsum(step * (side == index))])
+        before = np.interp(arc, ends, inside)
+        missing = np.diff(before, append=before[:1] + inside[-1]) if len(arc) else inside[-1:]
+        wide = ~(width <= max_gap_mm) if len(arc) else np.ones(1, bool)
+        whole = float(inside[-1])
+        covered = 1.0 - float(missing[wide].sum()) / whole if whole > 0.0 else 1.0
+        zones.append(ZoneArc(covered_fraction=max(0.0, covered), largest_gap_mm=float(missing.max())))
+    return tuple(zones)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

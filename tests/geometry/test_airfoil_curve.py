@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from geometry.chart import NODES, SectionSettings, outward_normals, unroll
+from geometry.chords import chord
 from geometry.curve import (
     area,
     camber_line,
     centroid,
     centroid_gradient,
-    chord,
     edge,
     edge_radius,
     gauge,
@@ -80,7 +80,7 @@ def test_gradients_foretell_what_small_deviations_do(bump):
     nominal = curve.copy()
     for measure in (
         lambda c: orientation(c, nominal),
-        lambda c: chord(c, le, te).length,
+        lambda c: chord(c, le, te).line.length,
         lambda c: chord(c, le, te).stagger,
         lambda c: thickness(c, thick),
         lambda c: edge_radius(c, le.arc),
@@ -101,7 +101,7 @@ def test_orientation_is_the_turn_counter_clockwise_whatever_the_shift(turn_deg):
 def test_chord_and_stagger_of_a_straight_airfoil(turn_deg):
     curve = nodes_of(STRAIGHT, turn_deg)
     found = chord(curve, edge(curve, NODES // 2), edge(curve, 0))
-    assert found.length.value == pytest.approx(44.0 + 0.8 + 0.45, abs=2e-5)
+    assert found.line.length.value == pytest.approx(44.0 + 0.8 + 0.45, abs=2e-5)
     assert np.rad2deg(found.stagger.value) == pytest.approx(turn_deg, abs=1e-4)
 
 
@@ -112,7 +112,7 @@ def test_chord_is_the_largest_distance_of_any_two_points(camber_mm):
     i, j = farthest_pair(curve, every, every)
     found = chord(curve, edge(curve, NODES // 2), edge(curve, 0))
     between_nodes_mm = 6e-5
-    assert abs(found.length.value - np.linalg.norm(curve[i] - curve[j])) < between_nodes_mm
+    assert abs(found.line.length.value - np.linalg.norm(curve[i] - curve[j])) < between_nodes_mm
 
 
 @pytest.mark.parametrize("camber_mm", [0.0, 4.0])
@@ -203,7 +203,7 @@ def test_two_thousand_airfoils_are_measured_without_a_failure():
         ends = edge(curve, le), edge(curve, 0)
         for end, radius in zip(ends, (airfoil.le_mm, airfoil.te_mm), strict=True):
             assert edge_radius(curve, end.arc).value == pytest.approx(radius, rel=0.01)
-        assert chord(curve, *ends).length.value >= np.linalg.norm(curve[le] - curve[0]) - 1e-9
+        assert chord(curve, *ends).line.length.value >= np.linalg.norm(curve[le] - curve[0]) - 1e-9
         measured += 1
 
 
