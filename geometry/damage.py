@@ -1,22 +1,24 @@
 """Damage regions of the scan against the twin: zone, kind, depth, area."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geometry.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
 from geometry.nominal import ZONE_ORDER, Nominal
 from geometry.regions import Field, Region, RegionSettings, find_regions, on_twin, stand_off
 from geometry.register import Alignment
-from geometry.solid import slice_loops
-from geometry.span import on_line_mm
 from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone
 
 PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
-FOREMOST = 5  # points whose middle one is the metal left of a slab: one alone is noise
-NEAR_EDGE_MM = 6.0  # of the edge line, where the edge of the twin is sought
+NOT_AN_EDGE = NotMeasured(reason="no loss of an edge")
+NOT_SOUGHT = NotMeasured(reason="was not looked for")
+ALONE = NotMeasured(reason="no other damage")
+HOLLOW_SPACINGS = 12.0  # width of the hollow, in point spacings, that the detection limit is stated for
+KEPT = 0.8  # of the depth of such a hollow is left in the mean over a neighbourhood
 PRECEDENCE = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
 
 
@@ -40,12 +42,14 @@ class Damage:
     length_mm: float  # largest extent
     centroid_mm: Floats  # (3,)
     points: Ints  # indices of the scan points on the damaged surface
+    remaining_chord_mm: Measured = NOT_AN_EDGE  # least, of a section there
+    above_root_mm: Measured = NOT_SOUGHT  # its lowest point over z_min
+    spacing_mm: Measured = ALONE  # straight to the nearest other damage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DamageSettings:
     regions: RegionSettings = field(default_factory=RegionSettings)
-    slab_mm: float = 0.4  # of an edge, over which its remaining metal is sought
     touching: float = 0.03  # share of a damage that must lie in a zone for the damage to touch it
     alike: float = 0.35  # least ratio of sizes of the two sides of a bent region
     beside_mm: float = 6.0  # how near those sides lie: about the thickness of an airfoil
@@ -70,7 +74,7 @@ def find_damages(
     bent, single = _bent_pairs(regions, found, settings)
     damages = [_described(region, found, nominal, twin, settings) for region in single]
     damages += [_bent(a, b, found, nominal, settings) for a, b in bent]
-    return tuple(damages)
+    return _spaced(damages, found)
 
 
 def detection_limit(
@@ -78,9 +82,10 @@ def detection_limit(
 ) -> dict[Zone, Measured]:
     """The depth per zone that is found with 95 % probability at the noise and density of this scan.
 
-    A dent is found when the mean over a neighbourhood passes `high` sigmas; it must exceed that by the
-    quantile of the noise of one such mean. At a tip or an edge the loss must also reach past the spacing of
-    the points, for metal between two points is not seen to be missing.
+    Stated for a hollow that runs out smoothly over `HOLLOW_SPACINGS`; a narrower one must be deeper. It is
+    found when the mean over a neighbourhood, which flattens it, passes `high` sigmas; it must exceed that by
+    the quantile of the noise of one such mean. At a tip or an edge the loss must also reach past the spacing
+    of the points, for metal between two points is not seen to be missing.
     """
     regions = settings.regions
     noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
@@ -88,7 +93,7 @@ def detection_limit(
     if not twin.supported.any():
         return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
     sigma_mm = float(np.hypot(mean_mm, np.quantile(twin.sigma_mm[twin.supported], 0.95)))
-    normal_mm = (regions.high + PROBABLE) * sigma_mm
+    normal_mm = (regions.high + PROBABLE) * sigma_mm / KEPT
     spacing_mm = _spacing_mm(cloud)
     along_mm = {Zone.TIP: spacing_mm, Zone.LEADING_EDGE: spacing_mm, Zone.TRAILING_EDGE: spacing_mm}
     return {
@@ -139,27 +144,64 @@ def _mirror(missing: Region, excess: Region, found: Field, settings: DamageSetti
 def _described(
     region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings
 ) -> Damage:
-    skin_mm = on_twin(nominal, twin)[region.lost]
-    points_mm = found.scan_mm[region.points]
+    body_mm = np.concatenate([found.scan_mm[region.points], on_twin(nominal, twin)[region.lost]])
     zone = _zone(region, found, nominal, settings.touching)
-    kind = DamageKind.MISSING if region.missing else DamageKind.EXCESS
-    depth: Measured
-    if kind is DamageKind.EXCESS or zone in (Zone.SURFACE, Zone.OUTSIDE):
-        depth = _normal_depth(region, found)
-    elif zone is Zone.TIP:
-        depth = _span_depth(region, found, nominal, twin, settings)
-    else:
-        depth = _edge_depth(region, found, nominal, twin, zone, settings.slab_mm)
+    lowest = lowest_mm(region, found, twin)
+    loss = _loss(region, found, nominal, twin, zone, lowest)
     return Damage(
         zone=zone,
-        kind=kind,
-        depth_mm=depth,
+        kind=DamageKind.MISSING if region.missing else DamageKind.EXCESS,
+        depth_mm=loss.depth_mm,
         area_mm2=_area(region, found, nominal),
         volume_mm3=_volume(region, found),
-        length_mm=_length_mm(np.concatenate([points_mm, skin_mm])),
-        centroid_mm=np.concatenate([points_mm, skin_mm]).mean(axis=0),
+        length_mm=_length_mm(body_mm),
+        centroid_mm=body_mm.mean(axis=0),
         points=region.points,
+        remaining_chord_mm=loss.remaining_chord_mm,
+        above_root_mm=_above_root(lowest, nominal),
     )
+
+
+def _loss(
+    region: Region, found: Field, nominal: Nominal, twin: Twin, zone: Zone, lowest: Measured
+) -> EdgeLoss:
+    """The depth of a damage by the rule of its zone, and the chord left where that is an edge."""
+    if region.missing and zone in (Zone.LEADING_EDGE, Zone.TRAILING_EDGE):
+        return edge_loss(region, found, nominal, twin, zone)
+    if region.missing and zone is Zone.TIP:
+        return EdgeLoss(depth_mm=_tip_depth(lowest, nominal, twin), remaining_chord_mm=NOT_AN_EDGE)
+    return EdgeLoss(depth_mm=normal_depth(region, found), remaining_chord_mm=NOT_AN_EDGE)
+
+
+def _tip_depth(lowest: Measured, nominal: Nominal, twin: Twin) -> Measured:
+    tip_face = nominal.samples.tip_face
+    if not tip_face.any():
+        return NotMeasured(reason="the span ends short of the tip")
+    return span_depth(float(on_twin(nominal, twin)[tip_face, 2].mean()), lowest)
+
+
+def _above_root(lowest: Measured, nominal: Nominal) -> Measured:
+    if isinstance(lowest, NotMeasured):
+        return lowest
+    return replace(lowest, name="above_root", value=lowest.value - nominal.z_min_mm)
+
+
+def _spaced(damages: list[Damage], found: Field) -> tuple[Damage, ...]:
+    """The damages, each with its distance to the nearest other one."""
+    if len(damages) < 2:
+        return tuple(damages)
+    trees = [cKDTree(found.scan_mm[damage.points]) for damage in damages]
+    return tuple(
+        replace(damage, spacing_mm=_spacing(own, [tree for tree in trees if tree is not own], found))
+        for damage, own in zip(damages, trees, strict=True)
+    )
+
+
+def _spacing(own: cKDTree, others: list[cKDTree], found: Field) -> Measurand:
+    """Distance to the nearest of the other damages; both borders lie within half a point spacing."""
+    apart_mm = min(float(np.min(own.query(other.data)[0])) for other in others)
+    sigma_mm = found.spacing_mm / np.sqrt(6.0)
+    return Measurand(name="spacing", value=apart_mm, sigma=float(sigma_mm), unit="mm")
 
 
 def _bent(
@@ -172,7 +214,7 @@ def _bent(
     return Damage(
         zone=_zone(both, found, nominal, settings.touching),
         kind=DamageKind.DEFORMATION,
-        depth_mm=_normal_depth(deeper, found),
+        depth_mm=normal_depth(deeper, found),
         area_mm2=_area(both, found, nominal),
         volume_mm3=NotMeasured(reason="bent metal is neither missing nor in excess"),
         length_mm=_length_mm(found.scan_mm[points]),
@@ -197,93 +239,14 @@ def _zone(region: Region, found: Field, nominal: Nominal, touching: float) -> Zo
     return Zone.OUTSIDE
 
 
-def _normal_depth(region: Region, found: Field) -> Measurand:
-    """The largest distance normal to the twin.
-
-    The mean over a neighbourhood flattens the bottom of a narrow pit; how much is told by how that mean
-    itself falls off over the same neighbourhood, and is given back.
-    """
-    height_mm = np.abs(found.smooth_mm)
-    deepest = region.points[int(np.argmax(height_mm[region.points]))]
-    flattened_mm = float(height_mm[deepest] - np.abs(found.smooth_mm[found.neighbours[deepest]]).mean())
-    value_mm = float(height_mm[deepest]) + max(flattened_mm, 0.0)
-    sigma_mm = float(np.hypot(found.sigma_mm[deepest], 0.5 * flattened_mm))
-    return Measurand(name="depth", value=value_mm, sigma=sigma_mm, unit="mm")
-
-
-def _span_depth(
-    region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings
-) -> Measured:
-    """The loss along the span: from the twin's tip down to the lowest point of the broken surface.
-
-    Where the break runs out into the skin, the last of it stands off by less than a region's threshold; a
-    break at 45 degrees hides about that much of its height.
-    """
-    tip_face = nominal.samples.tip_face
-    if not tip_face.any():
-        return NotMeasured(reason="the span ends short of the tip")
-    tip_mm = float(on_twin(nominal, twin)[tip_face, 2].mean())
-    lowest = np.sort(found.scan_mm[region.points, 2])[: max(3, len(region.points) // 2000)]
-    hidden_mm = settings.regions.low * _median_sigma_mm(region, found)
-    sigma_mm = np.hypot(hidden_mm, found.spacing_mm / np.sqrt(12.0))
-    return Measurand(
-        name="depth",
-        value=max(tip_mm - float(lowest.mean()) + hidden_mm, 0.0),
-        sigma=float(np.hypot(sigma_mm, np.std(lowest))),
-        unit="mm",
-    )
-
-
-def _median_sigma_mm(region: Region, found: Field) -> float:
-    return float(np.median(found.sigma_mm[region.points]))
-
-
-def _edge_depth(
-    region: Region, found: Field, nominal: Nominal, twin: Twin, zone: Zone, slab_mm: float
-) -> Measured:
-    """The largest loss in a section plane, along the chord: from the twin's edge to the metal left."""
-    z_mm = found.scan_mm[region.points, 2]
-    near_mm = _around(found.scan_mm, region.points, slab_mm)
-    flat = np.zeros((len(twin.mesh.faces), 3, 3))
-    heights_mm = np.arange(z_mm.min() + 0.5 * slab_mm, z_mm.max(), 0.5 * slab_mm)
-    losses = []
-    for height_mm in heights_mm if len(heights_mm) else [float(z_mm.mean())]:
-        outward, edge_mm = _outward(nominal, zone, float(height_mm))
-        slab = near_mm[np.abs(near_mm[:, 2] - height_mm) <= 0.5 * slab_mm, :2] @ outward
-        loops = slice_loops(twin.mesh, flat, float(height_mm))
-        rim = np.concatenate([loop.points_mm for loop in loops]) if loops else np.zeros((0, 2))
-        rim = rim[np.linalg.norm(rim - edge_mm, axis=1) < NEAR_EDGE_MM]
-        if len(slab) >= FOREMOST and len(rim):
-            losses.append(float((rim @ outward).max() - np.median(np.sort(slab)[-FOREMOST:])))
-    if not losses:
-        return NotMeasured(reason="no section through the damage has enough points on it")
-    sigma_mm = np.hypot(_median_sigma_mm(region, found), found.spacing_mm / np.sqrt(12.0))
-    return Measurand(name="depth", value=max(*losses, 0.0), sigma=float(sigma_mm), unit="mm")
-
-
-def _around(scan_mm: Floats, points: Ints, margin_mm: float) -> Floats:
-    """The scan points in the box of some of them."""
-    low_mm, high_mm = scan_mm[points].min(axis=0) - margin_mm, scan_mm[points].max(axis=0) + margin_mm
-    return np.asarray(scan_mm[((scan_mm >= low_mm) & (scan_mm <= high_mm)).all(axis=1)])
-
-
-def _outward(nominal: Nominal, zone: Zone, z_mm: float) -> tuple[Floats, Floats]:
-    """The direction (2,) along the chord out of an edge at a height, and the edge (2,) there."""
-    le_mm, te_mm = (
-        on_line_mm(line, np.array([z_mm]))[0] for line in (nominal.le_line_mm, nominal.te_line_mm)
-    )
-    chord_mm = le_mm - te_mm if zone is Zone.LEADING_EDGE else te_mm - le_mm
-    return chord_mm / np.linalg.norm(chord_mm), le_mm if zone is Zone.LEADING_EDGE else te_mm
-
-
 def _area(region: Region, found: Field, nominal: Nominal) -> Measurand:
-    """Area of the skin that the damage has taken: bare skin, or where the break lies close beneath, that
-    of the points on it."""
+    """Area of the skin that the damage has taken: bare skin, which begins half a point spacing inside the
+    border, or where the break lies close beneath, that of the points on it."""
     bare_mm2 = float(nominal.samples.area_mm2[region.lost].sum())
     points_mm2 = len(region.points) * found.spacing_mm**2
-    value = bare_mm2 if bare_mm2 > 0.5 * points_mm2 else points_mm2
-    border_mm = 4.0 * np.sqrt(value)
-    return Measurand(name="area", value=value, sigma=float(border_mm * found.spacing_mm / 2.0), unit="mm2")
+    strip_mm2 = 2.0 * np.sqrt(max(bare_mm2, points_mm2)) * found.spacing_mm  # along four equal sides
+    value = bare_mm2 + strip_mm2 if bare_mm2 > 0.5 * points_mm2 else points_mm2
+    return Measurand(name="area", value=float(value), sigma=float(strip_mm2), unit="mm2")
 
 
 def _volume(region: Region, found: Field) -> Measured:
@@ -292,7 +255,7 @@ def _volume(region: Region, found: Field) -> Measured:
         return NotMeasured(reason="from its patch")
     depth_mm = np.abs(found.smooth_mm[region.points])
     share_mm2 = found.spacing_mm**2
-    sigma = len(depth_mm) * share_mm2 * _median_sigma_mm(region, found)
+    sigma = len(depth_mm) * share_mm2 * float(np.median(found.sigma_mm[region.points]))
     value = float(depth_mm.sum()) * share_mm2
     return Measurand(name="volume", value=value, sigma=float(np.hypot(sigma, 0.05 * value)), unit="mm3")
 

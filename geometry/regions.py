@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from geometry.broken import Skin
 from geometry.errors import BadInput
-from geometry.kernels.graph import grow, neighbourhood_mean
+from geometry.kernels.graph import dilate, grow, neighbourhood_mean
 from geometry.nominal import Nominal
 from geometry.register import Alignment
 from geometry.surface import k_nearest
@@ -18,6 +18,7 @@ from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Ints
 
 SKIN_SPACINGS = 3.0  # skin farther than this many point spacings from every sound point has lost its cover
+NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +50,8 @@ class Field:
     scan_mm: Floats  # (n, 3)
     neighbours: Ints  # (n, k)
     spacing_mm: float  # between neighbouring points
+    noise_mm: float  # of a single point
+    height_mm: Floats  # (n,) distance of each point
     smooth_mm: Floats  # (n,) mean distance over the neighbourhood
     sigma_mm: Floats  # (n,) of that mean
     on_airfoil: Bools  # (n,) nearest to required surface
@@ -77,6 +80,8 @@ def stand_off(
         scan_mm=scan_mm,
         neighbours=neighbours,
         spacing_mm=float(np.median(distances_mm[:, -1]) * np.sqrt(np.pi / neighbours.shape[1])),
+        noise_mm=noise_mm,
+        height_mm=distance_mm,
         smooth_mm=neighbourhood_mean(distance_mm, neighbours[:, 1:]),
         sigma_mm=np.sqrt(np.maximum(mean_sigma_mm, settings.floor_mm) ** 2 + twin_sigma_mm**2),
         on_airfoil=nominal.airfoil_face[twin.nominal_face[face]],
@@ -93,21 +98,28 @@ def find_regions(field: Field, nominal: Nominal, twin: Twin, settings: RegionSet
     groups = [
         (points, missing)
         for missing, sign in ((True, -1.0), (False, 1.0))
-        for points in _connected(sign * field.smooth_mm, field, settings)
+        for points in _connected(sign * field.smooth_mm, sign * field.height_mm, field, settings)
     ]
     lost = _lost_skin(field, groups, nominal, twin)
     absent, excess = [i for i, g in enumerate(groups) if g[1]], [i for i, g in enumerate(groups) if not g[1]]
     merged = _merged([(groups[i][0], lost[i]) for i in absent], field, nominal, settings.join_mm)
     regions = [Region(points=points, lost=skin, missing=True) for points, skin in merged]
-    regions += [Region(points=groups[i][0], lost=np.zeros(0, np.int64), missing=False) for i in excess]
+    regions += [Region(points=groups[i][0], lost=NONE, missing=False) for i in excess]
     return sorted(regions, key=lambda region: -len(region.points))
 
 
-def _connected(height_mm: Floats, field: Field, settings: RegionSettings) -> list[Ints]:
-    """Index sets of the points that stand off by `high` sigmas, with all that hang together above `low`."""
-    certain = field.on_airfoil & (height_mm > settings.high * field.sigma_mm)
-    likely = field.on_airfoil & (height_mm > settings.low * field.sigma_mm)
-    chosen = np.flatnonzero(grow(certain, likely, field.neighbours))
+def _connected(mean_mm: Floats, own_mm: Floats, field: Field, settings: RegionSettings) -> list[Ints]:
+    """Index sets of the points whose mean stands off by `high` sigmas, with what hangs together above `low`.
+
+    Next to a deep break the means reach past its border: sound points among them are given back, and points
+    that the means of their sound neighbours hide are taken in.
+    """
+    certain = field.on_airfoil & (mean_mm > settings.high * field.sigma_mm)
+    likely = field.on_airfoil & (mean_mm > settings.low * field.sigma_mm)
+    reached = grow(certain, likely, field.neighbours)
+    proven = field.on_airfoil & (own_mm > settings.low * np.maximum(field.noise_mm, field.sigma_mm))
+    wider = dilate(reached, field.neighbours) & proven
+    chosen = np.flatnonzero(wider | (reached & (own_mm > 0.5 * mean_mm)))
     labels = _labels(chosen, field.neighbours)
     groups = [chosen[labels == label] for label in np.unique(labels)]
     return [group for group in groups if len(group) >= settings.least_points]
@@ -138,7 +150,7 @@ def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal, 
     sound_mm = np.asarray(cKDTree(field.scan_mm[sound]).query(skin_mm, distance_upper_bound=reach_mm)[0])
     bare = np.flatnonzero(~np.isfinite(sound_mm))
     if not (len(bare) and groups):
-        return [np.zeros(0, np.int64) for _ in groups]
+        return [NONE for _ in groups]
     patch = _patches(skin_mm[bare], 2.5 * nominal.settings.sample_mm)
     damaged = np.flatnonzero(owner >= 0)
     distance_mm, nearest = cKDTree(field.scan_mm[damaged]).query(skin_mm[bare])
@@ -149,7 +161,16 @@ def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal, 
         if distance_mm[members].min() <= 2.0 * reach_mm:
             for group in np.unique(nearest_owner[members]):
                 lost[group].append(bare[members & (nearest_owner == group)])
-    return [np.concatenate(parts) if parts else np.zeros(0, np.int64) for parts in lost]
+    loose = np.flatnonzero((sound_mm > field.spacing_mm) & np.isfinite(sound_mm))
+    return [
+        _to_the_border(np.concatenate(parts), loose, skin_mm, nominal) if parts else NONE for parts in lost
+    ]
+
+
+def _to_the_border(lost: Ints, loose: Ints, skin_mm: Floats, nominal: Nominal) -> Ints:
+    """The lost samples and those beside them that lie farther than a point spacing from sound points."""
+    apart_mm = np.asarray(cKDTree(skin_mm[lost]).query(skin_mm[loose])[0])
+    return np.concatenate([lost, loose[apart_mm <= 1.5 * nominal.settings.sample_mm]])
 
 
 def on_twin(nominal: Nominal, twin: Twin) -> Floats:

@@ -1,7 +1,7 @@
 """Twin minus scan: watertight patches with volume, for the repair shop."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import manifold3d
@@ -14,15 +14,17 @@ from geometry.broken import BrokenSurface, Scan, Skin, find_broken_surface, fram
 from geometry.columns import volume_by_columns
 from geometry.cut_body import cut_body
 from geometry.damage import Damage, DamageKind
+from geometry.depth import BORDER
 from geometry.errors import BadInput, CannotRepair
 from geometry.register import Alignment
 from geometry.solid import check_solid, volume_mm3
-from geometry.transforms import apply, inverse
+from geometry.transforms import apply, check_rigid, inverse
 from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh, NotMeasured, Zone
 
 BORDER_POINTS = 24  # sound points that tell how the skin meets the patch
 SAME_FACE = 0.9  # least cosine between places on one face of the part
+NOT_MEASURED = NotMeasured(reason="was not measured")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,15 +39,24 @@ class RepairSettings:
     sliver_fraction: float = 0.01  # pieces smaller than this share of the largest are dropped
     agreement: float = 0.05  # largest difference of the two volumes, relative
     agreement_mm3: float = 0.05  # and added to that
+    allowance_mm: float = 0.0  # for machining: the written patch stands out of the twin by so much
+    max_twin_sigma_mm: float = (
+        0.25  # of the twin over the lost skin; beyond, the form of the metal is a guess
+    )
 
     def __post_init__(self) -> None:
         if not (self.max_gap_mm > 0.0 and self.film_sigmas > 0.0 and self.resolution >= 5.0):
             raise BadInput("repair settings: gap, film and resolution must be positive")
+        if not (0.0 <= self.allowance_mm < np.inf and self.max_twin_sigma_mm > 0.0):
+            raise BadInput("repair settings: an allowance below zero, or no uncertainty of the twin allowed")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Patch:
-    """The metal to put back for one damage: a closed, oriented solid in the nominal frame."""
+    """The metal to put back for one damage: a closed, oriented solid in the nominal frame.
+
+    `mesh` is the metal that was lost; `written` is what the repair shop gets, with the machining allowance.
+    """
 
     damage: int  # index into the damages it was made for
     zone: Zone
@@ -57,6 +68,18 @@ class Patch:
     broken_gap_mm: float  # diameter of the largest empty disc on the broken surface
     border_step_mm: Measured  # largest height of the sound skin off the patch's, along the border
     border_angle_deg: Measured  # and largest angle between them
+    area_mm2: Measured = NOT_MEASURED  # of the lost skin
+    allowance_mm: float = 0.0
+
+    @property
+    def written(self) -> Mesh:
+        """The patch with its allowance beyond the twin's skin."""
+        return with_allowance(self, self.allowance_mm) if self.allowance_mm else self.mesh
+
+    @property
+    def written_mm3(self) -> Measurand:
+        """Volume of the patch as written; the allowance adds nothing to its uncertainty."""
+        return replace(self.volume_mm3, name="written_mm3", value=volume_mm3(self.written))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,9 +109,15 @@ def find_repairs(
     return RepairVolume(patches=tuple(patches), volume_mm3=_total(patches), failures=failures)
 
 
+def in_frame(mesh: Mesh, T_to_nominal: Floats) -> Mesh:
+    """The mesh of the nominal frame in another one, of a fixture or a machine: `T_to_nominal` (4, 4)."""
+    check_rigid(T_to_nominal, "the pose of a patch")
+    return Mesh(vertices_mm=apply(T_to_nominal, mesh.vertices_mm), faces=mesh.faces)
+
+
 def to_scan_frame(mesh: Mesh, alignment: Alignment) -> Mesh:
     """The mesh as it lies on the scanned part: moved from the nominal frame back into the scan's."""
-    return Mesh(vertices_mm=apply(inverse(alignment.T_nominal_scan), mesh.vertices_mm), faces=mesh.faces)
+    return in_frame(mesh, inverse(alignment.T_nominal_scan))
 
 
 def with_allowance(patch: Patch, allowance_mm: float) -> Mesh:
@@ -143,7 +172,12 @@ def _patch(
     allowed = settings.agreement * volume + settings.agreement_mm3
     if not abs(volume - check) <= allowed:
         raise CannotRepair(f"two ways to its volume disagree: {volume:.3f} and {check:.3f} mm3")
-    sigma = _volume_sigma(mesh, outer, twin, broken, abs(volume - check), dropped_mm3)
+    skin_sigma_mm, area_mm2 = _on_lost_skin(mesh, outer, twin)
+    twin_sigma_mm = float(skin_sigma_mm @ area_mm2 / area_mm2.sum())
+    if not twin_sigma_mm <= settings.max_twin_sigma_mm:
+        raise CannotRepair(f"over the lost skin the twin is known to {twin_sigma_mm:.2f} mm only")
+    from_twin_mm3 = float(skin_sigma_mm @ area_mm2)
+    sigma = _volume_sigma(mesh, outer, from_twin_mm3, broken, abs(volume - check), dropped_mm3)
     step, angle = _border(mesh, outer, broken)
     return Patch(
         damage=index,
@@ -156,6 +190,8 @@ def _patch(
         broken_gap_mm=gap_mm,
         border_step_mm=step,
         border_angle_deg=angle,
+        area_mm2=_lost_area(mesh, outer, area_mm2, broken),
+        allowance_mm=settings.allowance_mm,
     )
 
 
@@ -258,8 +294,28 @@ def _border(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> tuple[Measured, 
     )
 
 
+def _on_lost_skin(mesh: Mesh, outer: Bools, twin: Twin) -> tuple[Floats, Floats]:
+    """Standard uncertainty of the twin (n,) at the outer faces, and the areas (n,) of these."""
+    middle_mm, area_mm2 = _faces(mesh, outer)
+    return twin.sigma_mm[cKDTree(twin.mesh.vertices_mm).query(middle_mm)[1]], area_mm2
+
+
+def _lost_area(mesh: Mesh, outer: Bools, area_mm2: Floats, broken: BrokenSurface) -> Measurand:
+    """Area of the outer skin; its border is known to a part of the spacing of the points."""
+    corner_mm, on_border = mesh.vertices_mm[mesh.faces[outer]], np.isin(mesh.faces[outer], mesh.faces[~outer])
+    edge_mm = np.linalg.norm(np.roll(corner_mm, -1, axis=1) - corner_mm, axis=2)
+    border_mm = float(edge_mm[on_border & np.roll(on_border, -1, axis=1)].sum())
+    sigma = BORDER * float(np.median(broken.spacing_mm)) * border_mm
+    return Measurand(name="area_mm2", value=float(area_mm2.sum()), sigma=sigma, unit="mm2")
+
+
 def _volume_sigma(
-    mesh: Mesh, outer: Bools, twin: Twin, broken: BrokenSurface, difference_mm3: float, dropped_mm3: float
+    mesh: Mesh,
+    outer: Bools,
+    from_twin_mm3: float,
+    broken: BrokenSurface,
+    difference_mm3: float,
+    dropped_mm3: float,
 ) -> float:
     """Standard uncertainty of the volume, mm3.
 
@@ -268,10 +324,8 @@ def _volume_sigma(
     disagree by and what was dropped stand for the shape between the points.
     """
     middle_mm, area_mm2 = _faces(mesh, outer)
-    _, nearest = cKDTree(twin.mesh.vertices_mm).query(middle_mm)
-    from_twin = float((twin.sigma_mm[nearest] * area_mm2).sum())
     from_noise = broken.sigma_mm * broken.area_mm2 / np.sqrt(len(broken.raw_mm))
     to_break_mm, _ = cKDTree(_faces(mesh, ~outer)[0]).query(middle_mm)
     from_film = broken.film_mm * float(area_mm2[to_break_mm < broken.film_mm].sum()) / np.sqrt(12.0)
     from_shape = np.hypot(difference_mm3 / np.sqrt(12.0), dropped_mm3 / np.sqrt(3.0))
-    return float(np.linalg.norm([from_twin, from_noise, from_film, from_shape]))
+    return float(np.linalg.norm([from_twin_mm3, from_noise, from_film, from_shape]))

@@ -1,13 +1,14 @@
 """The damage-free twin: the nominal deformed non-rigidly onto the sound part of the scan."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from geometry.errors import CannotFitTwin
 from geometry.freeform import COMPONENTS, Freeform, Lattice, fit_freeform, lattice_over, swell
-from geometry.kernels.graph import grow
-from geometry.nominal import Nominal
+from geometry.kernels.graph import dilate, grow
+from geometry.nominal import Closest, Nominal
 from geometry.offset import Nodes, Offset, fit_offset, scatter_nodes
 from geometry.refine import Refined, refine
 from geometry.register import Alignment
@@ -20,6 +21,7 @@ COARSER = 2.0  # spacing of the nodes that the free form is fitted to, in those 
 PATCH_CELLS = 0.4  # what the lattice cannot follow is alike over this part of a cell
 FIRST_STIFFNESS = 1e4  # of the free form, before the data set it
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
+SORT_CELL_MM = 2.0  # points in one such cell are handled together
 NO_NOISE_MM = 1e-5  # least scatter believed
 
 
@@ -75,12 +77,14 @@ def fit_twin(
     Raises `CannotFitTwin` when sound points do not hold enough of the airfoil.
     """
     scan_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
+    order = _near_each_other(scan_mm)  # what is asked together then lies in the cache
+    scan_mm, mask, point_sigma_mm = scan_mm[order], mask[order], cloud.sigma_mm[order]
     rng = np.random.default_rng(settings.seed)
-    ground = _prepare(nominal, len(cloud), settings)
+    ground = _prepare(nominal, min(settings.nodes, max(len(cloud) // 4, 100)), settings)
     field, rounds, converged = _fit_smooth(scan_mm, mask, ground, settings, rng)
-    found = _compare(scan_mm, field, ground, None)
+    found = _compare(scan_mm, field, ground, nominal.closest(scan_mm))
     sound = _screen(found, found.usable, ground, settings.damage_mm)
-    offset, noise_mm = _fit_ripple(found, sound, cloud.sigma_mm, field, ground, settings, rng)
+    offset, noise_mm = _fit_ripple(found, sound, point_sigma_mm, field, ground, settings, rng)
     surface = _surface(field, offset, settings, rng)
     displacement_mm, sigma_mm, supported = _vertices(ground.refined, field, offset, surface, rng)
     return Twin(
@@ -92,12 +96,18 @@ def fit_twin(
         sigma_mm=sigma_mm,
         supported=supported,
         form_mm=_form(surface, ground.nodes, alignment),
-        sound=sound,
+        sound=sound[np.argsort(order)],
         noise_mm=noise_mm,
-        sound_rms_mm=_rms(found, sound, offset),
+        sound_rms_mm=offset.rms_mm,
         iterations=rounds,
         converged=converged,
     )
+
+
+def _near_each_other(points_mm: Floats) -> Ints:
+    """An order of the points in which those of one cell of a grid follow each other."""
+    cell = np.floor(points_mm / SORT_CELL_MM).astype(np.int64)
+    return np.asarray(np.lexsort(cell.T))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,11 +123,13 @@ class _Ground:
     patch_nodes: float  # coarse nodes over which the misfit of the free form is alike
 
 
-def _prepare(nominal: Nominal, points: int, settings: TwinSettings) -> _Ground:
+@lru_cache(maxsize=2)
+def _prepare(nominal: Nominal, wanted: int, settings: TwinSettings) -> _Ground:
+    """The ground of a fit with about so many nodes, kept from one part to the next."""
     lattice = lattice_over(nominal.samples.points_mm, settings.cells)
     corners = solid_normals(nominal.mesh).corner
     refined = refine(nominal.mesh, corners, nominal.airfoil_face, lattice.cell_mm / 6.0)
-    nodes = _scatter(nominal, refined, min(settings.nodes, max(points // 4, 100)))
+    nodes = _scatter(nominal, refined, wanted)
     coarse = scatter_nodes(nodes.points_mm, nodes.normals, 1.0, COARSER * nodes.spacing_mm)
     return _Ground(
         nominal=nominal,
@@ -153,29 +165,24 @@ def _scatter(nominal: Nominal, refined: Refined, wanted: int) -> Nodes:
 class _Found:
     """Scan points against the nominal moved by the free form."""
 
-    feet_mm: Floats  # (n, 3) on the nominal
-    normals: Floats  # (n, 3) of the nominal there
+    near: Closest  # on the nominal
     along_mm: Floats  # (n,) signed, along the normal
     owner: Ints  # (n,) nearest node; -1 none
     usable: Bools  # (n,) straight above a foot on the airfoil
 
 
-def _compare(points_mm: Floats, field: Freeform | None, ground: _Ground, before: _Found | None) -> _Found:
-    """Points pulled back by the free form, as it is at their foot `before`, and compared with the nominal."""
-    pulled_mm = points_mm
+def _compare(points_mm: Floats, field: Freeform | None, ground: _Ground, foot: Closest) -> _Found:
+    """Points pulled back by the free form, as it is at their `foot`, and compared with the nominal."""
+    near, moved_mm = foot, np.zeros_like(points_mm)
     if field is not None:
-        foot = before or _compare(points_mm, None, ground, None)
-        pulled_mm = points_mm - field.displacement(foot.feet_mm, foot.normals)
-    near = ground.nominal.closest(pulled_mm)
-    moved_mm = np.zeros_like(points_mm)
-    if field is not None:
+        pulled_mm = points_mm - field.displacement(foot.points_mm, foot.normals)
+        near = ground.nominal.closest_from(pulled_mm, foot.face)
         moved_mm = field.displacement(near.points_mm, near.normals)
     along_mm = np.einsum("nj,nj->n", points_mm - moved_mm - near.points_mm, near.normals)
     aside_mm = np.sqrt(np.maximum(near.distance_mm**2 - along_mm**2, 0.0))
     owner = ground.nodes.owner(near.points_mm, near.normals)
     return _Found(
-        feet_mm=near.points_mm,
-        normals=near.normals,
+        near=near,
         along_mm=along_mm,
         owner=owner,
         usable=(aside_mm <= 0.5 * np.abs(along_mm) + 0.02) & (owner >= 0),
@@ -234,14 +241,14 @@ def _screen(found: _Found, chosen: Bools, ground: _Ground, damage_mm: float) -> 
     """Which of the chosen points (n,) lie on sound surface: their node does not stand out, nor they of it.
 
     A node stands out where its median is deeper than `damage_mm` and far from the common run of nodes, or
-    joins one that does and is half as deep.
+    joins one that does and is half as deep; so do the nodes around, for a hollow runs out flat.
     """
     median_mm, some = _medians(found.owner[chosen], found.along_mm[chosen], len(ground.nodes.points_mm))
     if not some.any():
         raise CannotFitTwin("no sound points on the airfoil")
     depth_mm = np.abs(median_mm)
     high_mm = max(damage_mm, 5.0 * _spread(median_mm[some]))
-    out = grow(depth_mm > high_mm, depth_mm > 0.5 * high_mm, ground.graph)
+    out = dilate(grow(depth_mm > high_mm, depth_mm > 0.5 * high_mm, ground.graph), ground.graph)
     apart_mm = np.abs(found.along_mm - median_mm[found.owner])
     single_mm = max(damage_mm, 5.0 * _spread(apart_mm[chosen]))
     return np.asarray(chosen & ~out[found.owner] & (apart_mm <= single_mm))
@@ -256,7 +263,7 @@ def _fit_smooth(
     """
     chosen = rng.permutation(len(scan_mm))[: settings.points]
     points_mm = scan_mm[chosen]
-    found = _compare(points_mm, None, ground, None)
+    found = _compare(points_mm, None, ground, ground.nominal.closest(points_mm))
     sound = found.usable & ~mask[chosen]
     stiffness = np.full(COMPONENTS, FIRST_STIFFNESS)
     before_mm = np.zeros(len(ground.nodes.points_mm))
@@ -270,7 +277,7 @@ def _fit_smooth(
         if settled and rounds > LOOSE_ROUNDS:
             return field, rounds, True
         before_mm = after_mm
-        found = _compare(points_mm, field, ground, found)
+        found = _compare(points_mm, field, ground, found.near)
         sound = _screen(found, found.usable, ground, loose_mm)
     if field is None:
         raise CannotFitTwin("no round was allowed")
@@ -287,7 +294,7 @@ def _smooth_round(
     settings: TwinSettings,
 ) -> Freeform:
     """One weighted fit to the node means; nodes of one patch share their misfit, so they count as few."""
-    feet_mm, normals, left_mm = (a[sound] for a in (found.feet_mm, found.normals, found.along_mm))
+    feet_mm, normals, left_mm = (a[sound] for a in (found.near.points_mm, found.near.normals, found.along_mm))
     owner = ground.coarse.owner(feet_mm, normals)
     held = owner >= 0
     feet_mm, normals, left_mm, owner = feet_mm[held], normals[held], left_mm[held], owner[held]
@@ -331,7 +338,9 @@ def _fit_ripple(
     rng: np.random.Generator,
 ) -> tuple[Offset, float]:
     """The offset field that the sound points ask for, and their scatter; each counts by its own sigma."""
-    feet_mm, normals, along_mm = (a[sound] for a in (found.feet_mm, found.normals, found.along_mm))
+    feet_mm, normals, along_mm = (
+        a[sound] for a in (found.near.points_mm, found.near.normals, found.along_mm)
+    )
     votes = _gather(feet_mm, normals, along_mm, found.owner[sound], ground.nodes)
     held = votes.count >= 3.0
     ripple_mm2 = float(np.mean(votes.along_mm[held] ** 2 - votes.noise_mm**2 / votes.count[held]))
@@ -372,11 +381,6 @@ def _surface(field: Freeform, offset: Offset, settings: TwinSettings, rng: np.ra
         sigma_mm=np.sqrt(offset.sigma_mm**2 + open_fraction * np.mean(free**2, axis=1)),
         held=offset.held,
     )
-
-
-def _rms(found: _Found, sound: Bools, offset: Offset) -> float:
-    carry = offset.nodes.interpolation(found.feet_mm[sound], found.normals[sound])
-    return float(np.sqrt(np.mean((found.along_mm[sound] - carry @ offset.value_mm) ** 2)))
 
 
 def _form(surface: _Surface, nodes: Nodes, alignment: Alignment) -> Measured:

@@ -158,9 +158,14 @@ def closest_on_triangles(
         p = points_mm[q]
         for axis in range(3):
             home[axis] = min(max(int((p[axis] - origin_mm[axis]) / cell_mm), 0), shape[axis] - 1)
+        inset = cell_mm  # of the point from the walls of its cell; negative outside the grid
+        for axis in range(3):
+            above = p[axis] - origin_mm[axis] - home[axis] * cell_mm
+            inset = min(inset, above, cell_mm - above)
         best2, squarest = 1e300, 0.0
         for ring in range(max(shape) + 1):
-            if ring > 0 and best2 <= ((ring - 1) * cell_mm) ** 2:
+            searched = inset + (ring - 1) * cell_mm
+            if searched > 0.0 and best2 < searched * searched:
                 break
             for i in range(max(home[0] - ring, 0), min(home[0] + ring, shape[0] - 1) + 1):
                 for j in range(max(home[1] - ring, 0), min(home[1] + ring, shape[1] - 1) + 1):

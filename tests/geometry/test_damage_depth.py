@@ -1,0 +1,112 @@
+"""Depth, chord left, height and spacing of damages on blades cut exactly, from dense scans to thin ones."""
+
+from functools import cache
+
+import manifold3d
+import numpy as np
+import pytest
+
+from geometry.damage import Damage, find_damages
+from geometry.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.types import Measurand, Measured, Zone
+from tests.geometry import repair_blades as blades
+
+NOISE_MM = 0.012
+DENSITIES = (60.0, 12.0, 3.0)  # points a square millimetre: all of a scan, every 5th, every 20th
+CUTTERS = {
+    "tip corner": (Zone.TIP, lambda: blades.tip_corner_cutter(8.0, 0.1)),
+    "edge nick": (Zone.LEADING_EDGE, blades.edge_nick_cutter),
+    "pit": (Zone.SURFACE, blades.pit_cutter),
+}
+
+
+@cache
+def nominal() -> Nominal:
+    return prepare_nominal(blades.blade_mesh(), NominalSettings(z_min_mm=1.0))
+
+
+@cache
+def damages(names: tuple[str, ...], per_mm2: float, seed: int) -> tuple[Damage, ...]:
+    cutters = {CUTTERS[name][0]: CUTTERS[name][1]() for name in names}
+    scanned = blades.specimen(cutters, NOISE_MM, np.random.default_rng(seed), per_mm2)
+    mask = scanned.on_break >= 0
+    return find_damages(scanned.cloud, mask, scanned.alignment, nominal(), scanned.twin)
+
+
+def one(name: str, per_mm2: float, seed: int) -> Damage:
+    (damage,) = damages((name,), per_mm2, seed)
+    assert damage.zone is CUTTERS[name][0]
+    return damage
+
+
+def number(measured: Measured) -> Measurand:
+    assert isinstance(measured, Measurand)
+    return measured
+
+
+@cache
+def lost(name: str) -> manifold3d.Manifold:
+    return blades.solid_of(blades.blade_mesh()) ^ CUTTERS[name][1]()
+
+
+def outline(solid: manifold3d.Manifold, z_mm: float) -> blades.Array:
+    return np.concatenate([np.asarray(part) for part in solid.slice(z_mm).to_polygons()])
+
+
+@cache
+def edge_truth() -> tuple[float, float]:
+    """Largest loss along the chord at the leading edge, and the least chord left."""
+    whole = blades.solid_of(blades.blade_mesh())
+    rest = whole - CUTTERS["edge nick"][1]()
+    rows = []
+    for z_mm in np.linspace(18.5, 21.5, 61):
+        le, te = blades.leading_edge_at(z_mm)[:2], blades.trailing_edge_at(z_mm)[:2]
+        outward = (le - te) / np.linalg.norm(le - te)
+        before, after = outline(whole, z_mm) @ outward, outline(rest, z_mm) @ outward
+        rows.append((before.max() - after.max(), np.ptp(after)))
+    losses, chords = np.array(rows).T
+    return float(losses.max()), float(chords.min())
+
+
+def truth(name: str) -> float:
+    if name == "tip corner":
+        return blades.SPAN_MM - float(blades.mesh_of(lost(name)).vertices_mm[:, 2].min())
+    return edge_truth()[0] if name == "edge nick" else 1.2
+
+
+@pytest.mark.parametrize("name", list(CUTTERS))
+def test_the_depth_is_unbiased_from_dense_to_thin_scans(name: str) -> None:
+    for per_mm2 in DENSITIES:
+        depths = [number(one(name, per_mm2, seed).depth_mm) for seed in range(4)]
+        errors_mm = np.array([depth.value - truth(name) for depth in depths])
+        sigmas_mm = np.array([depth.sigma for depth in depths])
+        spacing_mm = 1.0 / np.sqrt(per_mm2)
+        assert (np.abs(errors_mm) <= 3.0 * sigmas_mm).all()
+        assert abs(errors_mm.mean()) <= 0.5 * spacing_mm + 0.03
+        assert sigmas_mm.max() <= spacing_mm
+
+
+def test_the_chord_left_is_that_of_the_cut_section() -> None:
+    for per_mm2 in DENSITIES:
+        for seed in range(4):
+            chord = number(one("edge nick", per_mm2, seed).remaining_chord_mm)
+            assert abs(chord.value - edge_truth()[1]) <= 3.0 * chord.sigma
+
+
+def test_the_height_over_the_root_is_that_of_the_lowest_metal_lost() -> None:
+    for name in CUTTERS:
+        low_mm = float(blades.mesh_of(lost(name)).vertices_mm[:, 2].min()) - nominal().z_min_mm
+        for per_mm2 in DENSITIES:
+            height = number(one(name, per_mm2, 0).above_root_mm)
+            assert abs(height.value - low_mm) <= 3.0 * height.sigma + 0.02
+
+
+def test_damages_know_their_distance_to_the_nearest_other() -> None:
+    nick, pit = sorted(damages(("edge nick", "pit"), 12.0, 0), key=lambda damage: str(damage.zone))
+    gap_mm = blades.mesh_of(lost("edge nick")).vertices_mm
+    other_mm = blades.mesh_of(lost("pit")).vertices_mm
+    true_mm = np.linalg.norm(gap_mm[:, None] - other_mm, axis=2).min()
+    for damage in (nick, pit):
+        spacing = number(damage.spacing_mm)
+        assert abs(spacing.value - true_mm) <= 3.0 * spacing.sigma + 0.05
+    assert not isinstance(one("pit", 12.0, 0).spacing_mm, Measurand)
