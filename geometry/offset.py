@@ -111,6 +111,7 @@ class Offset:
     sigma_mm: Floats  # (n,)
     prior_sigma_mm: float
     held: Bools  # (n,) scan points speak for the node
+    rms_mm: float  # of the measured offsets about the field
 
 
 def fit_offset(
@@ -150,6 +151,7 @@ def fit_offset(
         sigma_mm=np.sqrt(np.mean(errors**2, axis=1)),
         prior_sigma_mm=prior_sigma_mm,
         held=votes >= max(1.0, 0.2 * float(np.median(votes))),
+        rms_mm=float(np.sqrt(np.mean((offsets_mm - carry @ value) ** 2))),
     )
 
 
