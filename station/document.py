@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from station.software import software_commit, software_version
 
 if TYPE_CHECKING:
     from geometry.airfoil import Section
+    from geometry.blade_line import BladeLine
     from geometry.coverage import ZoneCoverage
     from geometry.damage import Damage
     from geometry.register import Alignment
@@ -55,6 +56,7 @@ def document(measurement: Measurement, verdict: Verdict, plan: BladePlan, inputs
         "serial": inputs.serial,
         "alignment": alignment_of(measurement.alignment),
         "sections": [section_of(section) for section in measurement.sections],
+        "blade": blade_of(measurement.line),
         "form": values_of({"deviation_mm": measurement.form_mm}),
         "zones": [zone_of(zone) for zone in measurement.zones],
         "damages": [damage_of(damage) for damage in measurement.damages or ()],
@@ -127,6 +129,22 @@ def section_of(section: Section) -> Json:
         "not_measured": reasons_of(section.measurands),
         "measurands": {name: number_of(m) for name, m in section.measurands.items()},
         "nominals": {name: float(value) for name, value in section.nominals.items() if np.isfinite(value)},
+        "zones": {name: asdict(arc) for name, arc in section.zones.items()},
+    }
+
+
+def blade_of(line: BladeLine | None) -> Json | None:
+    """What the sections say together, each number beside its nominal."""
+    if line is None:
+        return None
+    judged = {"lean_x_deg": line.lean_x_deg, "lean_y_deg": line.lean_y_deg, "bow_mm": line.bow_mm}
+    return {
+        **values_of({name: each.measured for name, each in judged.items()}),
+        "nominals": {name: each.nominal for name, each in judged.items() if each.nominal is not None},
+        "relative_twist_deg": [
+            {"z_mm": list(twist.z_mm), **values_of({"twist_deg": twist.twist_deg.measured})}
+            for twist in line.relative_twist
+        ],
     }
 
 
@@ -141,7 +159,14 @@ def zone_of(zone: ZoneCoverage) -> Json:
 
 
 def damage_of(damage: Damage) -> Json:
-    sizes = {"depth_mm": damage.depth_mm, "area_mm2": damage.area_mm2, "volume_mm3": damage.volume_mm3}
+    sizes = {
+        "depth_mm": damage.depth_mm,
+        "area_mm2": damage.area_mm2,
+        "volume_mm3": damage.volume_mm3,
+        "remaining_chord_mm": damage.remaining_chord_mm,
+        "above_root_mm": damage.above_root_mm,
+        "spacing_mm": damage.spacing_mm,
+    }
     return {
         "zone": damage.zone.value,
         "kind": damage.kind.value,

@@ -13,12 +13,14 @@ from station.plans import CountLimit, Limit, same_z
 
 if TYPE_CHECKING:
     from geometry.airfoil import Section
+    from geometry.blade_line import Judged
     from geometry.damage import Damage
     from station.measurement import Measurement
     from station.plans import BladePlan
 
 JUDGED_ZONES = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
 UNITS = ("mm", "deg", "mm3")
+PROFILE = ("profile_mm", "profile_form_mm")  # the larger of its two ends is judged, min and max are reported
 
 
 class Outcome(StrEnum):
@@ -62,6 +64,7 @@ def find(measurement: Measurement, plan: BladePlan) -> tuple[Finding, ...]:
     """One finding for every limit of the plan, and one for damage in a zone without a depth limit."""
     return (
         *section_findings(measurement, plan),
+        *blade_findings(measurement, plan),
         *form_findings(measurement, plan),
         *damage_findings(measurement, plan),
     )
@@ -138,23 +141,37 @@ def characteristic(section: Section | None, key: str) -> tuple[Measured, float]:
     """What was measured for a limited key, and its nominal value (NaN: the nominal has none)."""
     if section is None:
         return NotMeasured(reason="the section was not measured"), 0.0
-    if key == "profile_mm":
-        return largest_profile(section), 0.0
     absent = NotMeasured(reason=section.reason or "was not measured")
+    if key.endswith(PROFILE):
+        ends = (
+            section.measurands.get(f"{key.removesuffix('_mm')}_{end}_mm", absent) for end in ("max", "min")
+        )
+        return largest(*ends), 0.0
     return section.measurands.get(key, absent), section.nominals.get(key, float("nan"))
 
 
-def largest_profile(section: Section) -> Measured:
-    """The profile deviation of largest magnitude, of the two that are reported."""
-    absent = NotMeasured(reason=section.reason or "was not measured")
-    both = [section.measurands.get(key, absent) for key in ("profile_max_mm", "profile_min_mm")]
-    largest: Measurand | None = None
-    for measured in both:
-        if isinstance(measured, NotMeasured):
-            return measured
-        if largest is None or abs(measured.value) > abs(largest.value):
-            largest = measured
-    return largest or absent
+def largest(*each: Measured) -> Measured:
+    """The value of largest magnitude; not measured if one of them is not."""
+    measured = [m for m in each if isinstance(m, Measurand)]
+    if len(measured) < len(each):
+        return next(m for m in each if isinstance(m, NotMeasured))
+    return max(measured, key=lambda m: abs(m.value))
+
+
+def blade_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Finding]:
+    """The findings of what the sections say together."""
+    k, line = plan.measurement.coverage_factor, measurement.line
+    for key, limit in plan.limits.blade.given().items():
+        name = f"blade.{key}"
+        if line is None:
+            yield unmeasured_finding(name, limit, "the sections were not measured", Outcome.HOLD)
+        elif key == "relative_twist_deg":
+            twists = [twist.twist_deg.measured for twist in line.relative_twist]
+            yield section_finding(name, limit, largest(*twists), 0.0, k)
+        else:
+            judged: Judged = getattr(line, key)
+            nominal = float("nan") if judged.nominal is None else judged.nominal
+            yield section_finding(name, limit, judged.measured, nominal, k)
 
 
 def form_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from geometry.airfoil import Section, measure_sections, with_damages
+from geometry.blade_line import blade_line
 from geometry.clean import CleanSettings, clean
 from geometry.coverage import measure_coverage
 from geometry.damage import Damage, DamageKind, DamageSettings, detection_limit, find_damages
@@ -77,6 +78,7 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
     sections = run.step(
         "sections", inspected, points, mask, alignment, recipe, twin=twin, damages=damages, repairs=repairs
     )
+    line = run.step("line", blade_line, sections, alignment)
     zones = run.step(
         "coverage",
         measure_coverage,
@@ -95,6 +97,7 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
         aligned_mm=shown[0] if shown else found.aligned_mm,
         deviation_mm=shown[1] if shown else found.deviation_mm,
         sections=sections or (),
+        line=line,
         outlines=recipe.outlines,
         twin_mesh=twin.mesh if twin else None,
         form_mm=twin.form_mm if twin else NO_TWIN,

@@ -12,6 +12,7 @@ from geometry.types import Floats, Measured, NotMeasured, Zone
 
 if TYPE_CHECKING:  # the rooms behind these types are heavy, and who only judges or shows needs none of them
     from geometry.airfoil import Section
+    from geometry.blade_line import BladeLine
     from geometry.coverage import ZoneCoverage
     from geometry.damage import Damage
     from geometry.register import Alignment
@@ -49,6 +50,7 @@ class Measurement:
     aligned_mm: Floats = field(default_factory=lambda: NO_POINTS)
     deviation_mm: Floats = field(default_factory=lambda: NO_VALUES)
     sections: tuple[Section, ...] = ()
+    line: BladeLine | None = None
     outlines: tuple[Outline, ...] = ()
     twin_mesh: Mesh | None = None
     form_mm: Measured = NO_TWIN

@@ -1,12 +1,21 @@
 """plan.toml, one part number: what is required of a blade and where its limits lie."""
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PrivateAttr,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from geometry.errors import BadInput
 from geometry.transforms import check_rigid
@@ -15,15 +24,43 @@ from station.tomlfile import BadFile, Number, Positive, Settings, Text, read_set
 
 SPAN_TOLERANCE_MM = 0.01  # a nominal in float32 does not end exactly where the plan says
 
-SectionKey = Literal[
-    "position_mm",
-    "orientation_deg",
-    "profile_mm",
-    "chord_mm",
-    "max_thickness_mm",
-    "le_radius_mm",
-    "te_radius_mm",
-]
+SECTION_KEYS = frozenset(
+    {
+        "position_mm",
+        "orientation_deg",
+        "profile_mm",
+        "profile_form_mm",
+        *(f"{side}_profile_mm" for side in ("le", "ss", "te", "ps")),
+        "chord_mm",
+        "chord_nose_tail_mm",
+        "chord_tangent_mm",
+        "stagger_deg",
+        "max_thickness_mm",
+        "max_thickness_position_mm",
+        "max_camber_mm",
+        *(
+            f"{end}_{name}_mm"
+            for end in ("le", "te")
+            for name in ("radius", "min_radius", "flat", "thickness")
+        ),
+        "waviness_rms_mm",
+        "waviness_height_mm",
+        "out_of_tolerance_fraction",
+        "fit_x_mm",
+        "fit_y_mm",
+        "fit_rotation_deg",
+    }
+)
+THICKNESS_AT = re.compile(r"(le|te)_thickness_at_([0-9.]+)_mm")
+
+
+def section_key(name: str) -> str:
+    """`name`, if a section has such a characteristic."""
+    if name not in SECTION_KEYS and not THICKNESS_AT.fullmatch(name):
+        raise ValueError("unknown key")
+    return name
+
+
 Row = tuple[Number, Number, Number, Number]
 DamageZone = Literal["tip", "leading_edge", "trailing_edge", "surface"]
 
@@ -107,45 +144,60 @@ class Algorithms(Settings):
     twin: Literal["default", "thesis"] = "default"
 
 
-class Sections(Settings):
-    z_mm: tuple[Number, ...] = ()
+class SectionFit(Settings):
+    """How the sections are best fitted for `fit_*` and `profile_form_mm`: weights of the sides, and locks."""
 
-    @field_validator("z_mm")
+    le: Annotated[Number, Field(ge=0.0)] = 1.0
+    suction: Annotated[Number, Field(ge=0.0)] = 1.0
+    te: Annotated[Number, Field(ge=0.0)] = 1.0
+    pressure: Annotated[Number, Field(ge=0.0)] = 1.0
+    locked: tuple[Literal["x", "y", "rotation"], ...] = ()
+
+    @model_validator(mode="after")
+    def weighs_something(self) -> Self:
+        if not self.le + self.suction + self.te + self.pressure > 0.0:
+            raise ValueError("all weights are 0")
+        return self
+
+
+class Sections(Settings):
+    """`tolerance_mm` is what `out_of_tolerance_fraction` counts against, `edge_distances_mm` where
+    `le_thickness_at_2_mm` and its like are taken."""
+
+    z_mm: tuple[Number, ...] = ()
+    tolerance_mm: Positive = 0.1
+    edge_distances_mm: tuple[Positive, ...] = (2.0, 4.0)
+    fit: SectionFit = SectionFit()
+
+    @field_validator("z_mm", "edge_distances_mm")
     @classmethod
-    def distinct(cls, z_mm: tuple[float, ...]) -> tuple[float, ...]:
+    def distinct(cls, z_mm: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
         if len(set(z_mm)) != len(z_mm):
-            raise ValueError("a section stands twice")
+            raise ValueError("a section stands twice" if info.field_name == "z_mm" else "one stands twice")
         return z_mm
 
 
-class SectionKeys(Settings):
-    position_mm: Limit | None = None
-    orientation_deg: Limit | None = None
-    profile_mm: Limit | None = None
-    chord_mm: Limit | None = None
-    max_thickness_mm: Limit | None = None
-    le_radius_mm: Limit | None = None
-    te_radius_mm: Limit | None = None
-
-    def given(self) -> dict[str, Limit]:
-        """The limits that stand here, by characteristic."""
-        limits = ((key, getattr(self, key)) for key in type(self).model_fields)
-        return {key: limit for key, limit in limits if limit is not None}
+SectionKeys = Mapping[Annotated[str, AfterValidator(section_key)], Limit]
 
 
 class SectionLimits(Settings):
     """Limits of every section, and those of single sections, which win key by key."""
 
-    every: SectionKeys = SectionKeys()
+    every: SectionKeys = Field(default_factory=dict)
     single: Mapping[float, SectionKeys] = Field(default_factory=dict)
 
     def at(self, z_mm: float) -> dict[str, Limit]:
         """The limits of the section at `z_mm`, matched numerically."""
-        own = next((keys for z, keys in self.single.items() if same_z(z, z_mm)), None)
-        return self.every.given() | (own.given() if own else {})
+        own = next((keys for z, keys in self.single.items() if same_z(z, z_mm)), {})
+        return {**self.every, **own}
+
+    @property
+    def limited(self) -> set[str]:
+        """Every characteristic that has a limit anywhere."""
+        return {key for keys in (self.every, *self.single.values()) for key in keys}
 
     def __bool__(self) -> bool:
-        return any(keys.given() for keys in (self.every, *self.single.values()))
+        return bool(self.limited)
 
 
 def same_z(a_mm: float, b_mm: float) -> bool:
@@ -190,8 +242,23 @@ class Form(Settings):
     deviation_mm: Limit | None = None
 
 
+class BladeLimits(Settings):
+    """Limits of what the sections say together; of the twist from section to section, the largest."""
+
+    lean_x_deg: Limit | None = None
+    lean_y_deg: Limit | None = None
+    bow_mm: Limit | None = None
+    relative_twist_deg: Limit | None = None
+
+    def given(self) -> dict[str, Limit]:
+        """The limits that stand here, by characteristic."""
+        limits = ((key, getattr(self, key)) for key in type(self).model_fields)
+        return {key: limit for key, limit in limits if limit is not None}
+
+
 class Limits(Settings):
     section: Annotated[SectionLimits, BeforeValidator(every_and_single)] = SectionLimits()
+    blade: BladeLimits = BladeLimits()
     form: Form = Form()
     damage: Mapping[DamageZone, DamageLimits] = Field(default_factory=dict)
 
@@ -200,7 +267,8 @@ class Limits(Settings):
         return next((limits for name, limits in self.damage.items() if name == zone), DamageLimits())
 
     def __bool__(self) -> bool:
-        return bool(self.section or self.form.deviation_mm or any(self.damage.values()))
+        sections = self.section or self.blade.given()
+        return bool(sections or self.form.deviation_mm or any(self.damage.values()))
 
 
 class Repair(Settings):
@@ -271,6 +339,12 @@ class BladePlan(Settings):
         for z_mm in self.limits.section.single:
             if not any(same_z(z_mm, other) for other in self.sections.z_mm):
                 raise ValueError(f'limits.section."{z_mm:g}": no such section in [sections] z_mm')
+        for key in self.limits.section.limited:
+            at = THICKNESS_AT.fullmatch(key)
+            if at and at[2] not in {f"{d:g}" for d in self.sections.edge_distances_mm}:
+                raise ValueError(f"limits.section.{key}: no such distance in [sections] edge_distances_mm")
+        if self.limits.blade.given() and len(self.sections.z_mm) < 2:
+            raise ValueError("limits.blade: fewer than two sections stand in [sections] z_mm")
         return self
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from geometry.airfoil import SectionSettings
 from geometry.calibrate import AxisCalibration
+from geometry.chart import FitSettings
 from geometry.coverage import CoverageSettings
 from geometry.errors import BadInput
 from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
@@ -31,7 +32,19 @@ class Recipe:
 
     @property
     def section_settings(self) -> SectionSettings:
-        return SectionSettings(max_gap_mm=self.plan.coverage.max_gap_mm)
+        wanted = self.plan.sections
+        return SectionSettings(
+            max_gap_mm=self.plan.coverage.max_gap_mm,
+            tolerance_mm=wanted.tolerance_mm,
+            edge_distances_mm=wanted.edge_distances_mm,
+            fit=FitSettings(
+                le=wanted.fit.le,
+                suction=wanted.fit.suction,
+                te=wanted.fit.te,
+                pressure=wanted.fit.pressure,
+                locked=frozenset(wanted.fit.locked),
+            ),
+        )
 
     @property
     def repair_settings(self) -> RepairSettings:

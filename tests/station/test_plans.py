@@ -179,6 +179,31 @@ def test_section_limits_need_a_section(folder: Path) -> None:
     assert fault(folder, text) == "limits.section: no section stands in [sections] z_mm"
 
 
+@pytest.mark.parametrize(
+    ("added", "what"),
+    [
+        ("[limits.section]\nbend_mm = {}", "limits.section.bend_mm: unknown key"),
+        (
+            "[limits.section]\nle_thickness_at_3_mm = { serviceable = 1, repairable = 2 }",
+            "limits.section.le_thickness_at_3_mm: no such distance in [sections] edge_distances_mm",
+        ),
+        ("[limits.blade]\nbow = {}", "limits.blade.bow: unknown key"),
+        ("[sections.fit]\nlocked = ['z']", "sections.fit.locked.0: Input should be 'x', 'y' or 'rotation'"),
+        ("[sections.fit]\nle=0\nsuction=0\nte=0\npressure=0", "sections.fit: all weights are 0"),
+    ],
+)
+def test_a_characteristic_that_no_section_has_is_refused(folder: Path, added: str, what: str) -> None:
+    text = PLAN.replace("[limits.section]", added) if added.startswith("[limits.section]") else PLAN + added
+    assert fault(folder, text).startswith(what)
+
+
+def test_blade_limits_need_two_sections(folder: Path) -> None:
+    one = PLAN.replace("[7.0, 52.5, 98.0]", "[52.5]") + (
+        "[limits.blade]\nbow_mm = { serviceable = 1, repairable = 2 }\n"
+    )
+    assert fault(folder, one) == "limits.blade: fewer than two sections stand in [sections] z_mm"
+
+
 def test_several_faults_are_counted(folder: Path) -> None:
     assert fault(folder, PLAN.replace("0.20", "nan").replace('"mm"', '"m"')).endswith("(and 1 more)")
 

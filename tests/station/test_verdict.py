@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geometry.blade_line import BladeLine, Judged, RelativeTwist
 from geometry.damage import DamageKind
 from geometry.types import Zone
 from station.findings import Finding, Outcome, described, outcome_of
@@ -270,6 +271,55 @@ def test_damage_that_nobody_looked_for_holds() -> None:
     assert {finding(done, f"damage.tip.{size}").value for size in ("depth_mm", "volume_mm3", "count")} == {
         None
     }
+
+
+BLADE = {
+    "bow_mm": {"serviceable": 0.1, "repairable": 0.5},
+    "relative_twist_deg": {"serviceable": 0.2, "repairable": 1.0},
+}
+
+
+def line(bow_mm: float, twists_deg: tuple[float, ...]) -> BladeLine:
+    """A straight blade with this bow and these twists, nominal 0.05 mm and 0."""
+    none = Judged(measured=number("lean_x_deg", 0.0), nominal=0.0)
+    return BladeLine(
+        lean_x_deg=none,
+        lean_y_deg=none,
+        bow_mm=Judged(measured=number("bow_mm", bow_mm), nominal=0.05),
+        relative_twist=tuple(
+            RelativeTwist(z_mm=(i, i + 1.0), twist_deg=Judged(measured=number("twist_deg", t), nominal=0.0))
+            for i, t in enumerate(twists_deg)
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        (line(0.10, (0.1, -0.1)), Word.PASS),
+        (line(0.30, (0.1, -0.1)), Word.REPAIR),
+        (line(0.10, (0.1, -0.5)), Word.REPAIR),
+        (line(0.10, (0.1, -1.5)), Word.SCRAP),
+        (None, Word.HOLD),
+    ],
+)
+def test_what_the_sections_say_together_is_judged(given: BladeLine | None, word: Word) -> None:
+    limited = plan({**LIMITS, "blade": BLADE}, z_mm=(7.0, 50.0))
+    sections = (section(7.0), section(50.0))
+    assert judge(measurement(sections=sections, line=given), limited, GATES).verdict == word
+
+
+def test_any_parameter_of_a_section_can_be_limited() -> None:
+    limits = {
+        "le_profile_mm": {"serviceable": 0.1, "repairable": 0.5},
+        "te_thickness_at_2_mm": {"serviceable": 0.1, "repairable": 0.5},
+    }
+    measured = {"le_profile_max_mm": 0.05, "le_profile_min_mm": -0.3, "te_thickness_at_2_mm": 1.0}
+    given = measurement(sections=(section(**measured),))
+    found = {each.characteristic: each for each in judge(given, plan({"section": limits}), GATES).findings}
+    assert found["sections[7.0].le_profile_mm"].deviation == -0.3
+    assert found["sections[7.0].le_profile_mm"].outcome == Outcome.REPAIR
+    assert found["sections[7.0].te_thickness_at_2_mm"].outcome == Outcome.HOLD  # it has no nominal here
 
 
 def test_deformation_is_judged_by_sections_and_form_only() -> None:
