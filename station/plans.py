@@ -27,6 +27,10 @@ SPAN_TOLERANCE_MM = 0.01  # a nominal in float32 does not end exactly where the 
 SECTION_KEYS = frozenset(
     {
         "position_mm",
+        "position_x_mm",
+        "position_y_mm",
+        "centroid_x_mm",
+        "centroid_y_mm",
         "orientation_deg",
         "profile_mm",
         "profile_form_mm",

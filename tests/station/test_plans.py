@@ -2,14 +2,17 @@
 
 import pickle
 import string
+import tomllib
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geometry.chart import SectionSettings
+from geometry.measurands import section_measurands
 from geometry.types import Zone
-from station.plans import BadPlan, BladePlan, check_span, read_plan
+from station.plans import SECTION_KEYS, BadPlan, BladePlan, check_span, read_plan
 
 PLAN = """\
 schema = "bladecell.plan/1"
@@ -195,6 +198,19 @@ def test_section_limits_need_a_section(folder: Path) -> None:
 def test_a_characteristic_that_no_section_has_is_refused(folder: Path, added: str, what: str) -> None:
     text = PLAN.replace("[limits.section]", added) if added.startswith("[limits.section]") else PLAN + added
     assert fault(folder, text).startswith(what)
+
+
+def test_every_name_that_can_be_limited_is_measured() -> None:
+    names = set(section_measurands(SectionSettings()))
+    profiles = {key for key in SECTION_KEYS if key.endswith(("profile_mm", "profile_form_mm"))}
+    assert SECTION_KEYS - profiles <= names
+    assert {f"{key.removesuffix('_mm')}_max_mm" for key in profiles} <= names
+
+
+def test_the_example_is_a_plan() -> None:
+    path = Path(__file__).parents[2] / "config/blades/example/plan.toml"
+    example = BladePlan.model_validate(tomllib.loads(path.read_text()), context={"path": path})
+    assert example.sections.edge_distances_mm == (2.0, 4.0)
 
 
 def test_blade_limits_need_two_sections(folder: Path) -> None:
