@@ -218,6 +218,8 @@ def patch_of(number: int, patch: Patch) -> Json:
         "watertight": patch.watertight,
         "volume_mm3": number_of(patch.volume_mm3),
         "volume_check_mm3": patch.volume_check_mm3,
+        "allowance_mm": patch.allowance_mm,
+        "written_mm3": number_of(patch.written_mm3),
         "broken_gap_mm": patch.broken_gap_mm,
         **values_of({"border_step_mm": patch.border_step_mm, "border_angle_deg": patch.border_angle_deg}),
     }

@@ -48,7 +48,9 @@ class Recipe:
 
     @property
     def repair_settings(self) -> RepairSettings:
-        return RepairSettings(max_gap_mm=self.plan.coverage.max_gap_mm)
+        return RepairSettings(
+            max_gap_mm=self.plan.coverage.max_gap_mm, allowance_mm=self.plan.repair.allowance_mm
+        )
 
     @property
     def coverage_settings(self) -> CoverageSettings:

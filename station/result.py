@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geometry.transforms import apply, inverse
-from geometry.types import Floats, Mesh
+from geometry.repair import in_frame
+from geometry.transforms import inverse
+from geometry.types import Mesh
 from station.document import Inputs, Json, document, document_text, patches_of
 from station.formats.threemf import threemf
 from station.formats.write import ply_cloud, ply_mesh, stl
@@ -63,11 +64,14 @@ def surfaces(measurement: Measurement) -> dict[str, bytes]:
 
 def repair_files(patches: list[Patch]) -> dict[str, bytes]:
     """Each patch as a file, and all of them as one of each format."""
-    meshes: list[Mesh] = [patch.mesh for patch in patches]
+    meshes: list[Mesh] = [patch.written for patch in patches]
     files = {f"repair-{number}.stl": stl([mesh]) for number, mesh in enumerate(meshes, 1)}
     if not meshes:
         return files
-    named = {f"repair-{number} {patch.zone}": patch.mesh for number, patch in enumerate(patches, 1)}
+    named = {
+        f"repair-{n} {patch.zone}": mesh
+        for n, (patch, mesh) in enumerate(zip(patches, meshes, strict=True), 1)
+    }
     return files | {"repair.stl": stl(meshes), "repair.3mf": threemf(named)}
 
 
@@ -80,14 +84,9 @@ def framed_files(measurement: Measurement, verdict: Verdict, plan: BladePlan) ->
     T_fixture_scan = np.eye(4) if plan.repair.T_fixture_scan is None else np.array(plan.repair.T_fixture_scan)
     frames = {"scan": T_scan_nominal, "fixture": T_fixture_scan @ T_scan_nominal}
     return {
-        f"repair-{frame}.stl": stl([moved(patch.mesh, frames[frame]) for patch in patches])
+        f"repair-{frame}.stl": stl([in_frame(patch.written, frames[frame]) for patch in patches])
         for frame in plan.repair.frames
     }
-
-
-def moved(mesh: Mesh, T: Floats) -> Mesh:
-    """The mesh in another frame."""
-    return Mesh(vertices_mm=apply(T, mesh.vertices_mm), faces=mesh.faces)
 
 
 def replace_files(folder: Path, files: Mapping[str, bytes]) -> None:

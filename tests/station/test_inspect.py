@@ -130,7 +130,6 @@ def test_a_section_off_the_nominal_is_refused(folder: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("old", "new", "where"),
     [
-        ("[limits.form]", "[repair]\nallowance_mm = 0.5\n[limits.form]", "repair.allowance_mm"),
         ("[sections]", '[algorithms]\ntwin = "thesis"\n[sections]', "algorithms.twin"),
         ("[sections]", '[alignment]\nmethod = "six_point"\n[sections]', "alignment.method"),
     ],

@@ -241,6 +241,18 @@ def test_patches_come_in_the_frames_that_the_plan_wants(tmp_path: Path) -> None:
     assert names(tmp_path) == ALWAYS | {"repair.stl", "repair.3mf", "repair-1.stl"}
 
 
+def test_an_allowance_is_in_the_files_and_apart_in_the_document(tmp_path: Path) -> None:
+    thick = replace(patch(0), allowance_mm=0.1)
+    inspected(tmp_path, measurement(damages=(damage(),), repairs=repairs(thick)))
+    written = json.loads((tmp_path / "result.json").read_text())["repair"]["patches"][0]
+    assert written["allowance_mm"] == 0.1
+    assert written["volume_mm3"]["value"] == 60.0
+    mesh = trimesh.load_mesh(tmp_path / "repair-1.stl")
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(written["written_mm3"]["value"], rel=1e-4)
+    assert mesh.volume > 1.1 * trimesh.Trimesh(thick.mesh.vertices_mm, thick.mesh.faces).volume
+
+
 def test_our_own_files_are_replaced_and_foreign_ones_are_not(tmp_path: Path) -> None:
     inspected(tmp_path, broken())
     for name in ("notes.txt", "repair-0.stl", "repair-x.stl", "my-result.json"):
