@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 
-from geometry.chart import NODES, SectionSettings, unroll
+from geometry.chart import NODES, Chart, SectionSettings, unroll
 from geometry.curve import Estimate, centroid, node_shares
 from geometry.errors import CannotMeasure
 from geometry.form import SIDES, share_beyond_sigma
@@ -108,8 +109,7 @@ def _measure(
     scan: Scan, alignment: Alignment, nominal: Nominal, z_mm: float, settings: SectionSettings
 ) -> Section:
     """One section."""
-    chart = unroll(nominal, z_mm, settings.band_mm, settings)
-    definition = define(chart.curve_mm, chart.side, settings)
+    chart, definition = _prepared(nominal, z_mm, settings)
     try:
         profile = reconstruct(scan, chart, settings)
     except CannotMeasure as why:
@@ -117,6 +117,13 @@ def _measure(
         return _absent(z_mm, gaps[0], str(why), definition)
     gaps = explain_gaps(profile.gaps, scan, nominal, z_mm, settings)
     return _section(replace(profile, gaps=gaps), definition, alignment)
+
+
+@lru_cache(maxsize=32)
+def _prepared(nominal: Nominal, z_mm: float, settings: SectionSettings) -> tuple[Chart, Definition]:
+    """What the nominal alone gives for one section; a blade of the same part finds it ready."""
+    chart = unroll(nominal, z_mm, settings.widest_band_mm, settings)
+    return chart, define(chart.curve_mm, chart.side, settings)
 
 
 def _section(profile: Profile, definition: Definition, alignment: Alignment) -> Section:
@@ -192,15 +199,17 @@ def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty)
         along, rms_mm = sigmas["waviness_rms_mm"], estimates["waviness_rms_mm"].value
         sigmas["waviness_rms_mm"] = waves.rms_sigma(rms_mm, along, amplitudes)
         sigmas["out_of_tolerance_fraction"] = share_beyond_sigma(
-            profile.deviation_mm, _node_sigmas(profile, uncertainty), share, definition.settings.tolerance_mm
+            profile.deviation_mm, _node_sigmas(profile), share, definition.settings.tolerance_mm
         )
     return sigmas
 
 
-def _node_sigmas(profile: Profile, uncertainty: _Uncertainty) -> Floats:
+def _node_sigmas(profile: Profile) -> Floats:
     """Standard uncertainty (NODES,) of the displacement of each node, from every 16th."""
     some = np.arange(0, NODES, 16)
-    covariance = profile.covariance(np.eye(NODES)[some]).diagonal()
+    each = np.zeros((len(some), NODES))
+    each[np.arange(len(some)), some] = 1.0
+    covariance = profile.covariance(each).diagonal()
     sigma = np.sqrt(np.append(covariance, covariance[0]))
     return np.interp(np.arange(NODES), np.append(some, NODES), sigma)
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.errors import BadInput
-from geometry.kernels.profile import project
+from geometry.kernels.profile import project, steepness, undo_motion
 from geometry.nominal import Nominal, NominalSection
 from geometry.types import Bools, Floats, Ints
 
@@ -51,7 +51,10 @@ class SectionSettings:
     """How sections are reconstructed."""
 
     max_gap_mm: float = 1.5  # an arc without points wider than this was not measured
-    band_mm: float = 6.0  # neighbouring z on each side that takes part
+    band_mm: float = 6.0  # neighbouring z on each side that takes part, at least ...
+    band_spacings: float = 60.0  # ... and of a sparser scan so many times the distance of its points, ...
+    widest_band_mm: float = 12.0  # ... but no more than this
+    most_z_spans: int = 5  # of the spline over a band
     layer_mm: float = 6.0  # of height that three nominal sections bridge, unless a parabola ...
     blend_mm: float = 0.0005  # ... is more than this off: then less,
     thinnest_layer_mm: float = 0.4  # down to this; ...
@@ -73,9 +76,18 @@ class SectionSettings:
 
     def __post_init__(self) -> None:
         lengths = (self.max_gap_mm, self.band_mm, self.layer_mm, self.knot_mm, self.edge_mm, self.z_knot_mm)
-        asked = (self.tolerance_mm, *self.edge_distances_mm, self.flat_mm, *self.wave_mm)
+        asked = (
+            self.band_spacings,
+            self.widest_band_mm,
+            self.tolerance_mm,
+            *self.edge_distances_mm,
+            self.flat_mm,
+            *self.wave_mm,
+        )
         if not all(np.isfinite(x) and x > 0.0 for x in (*lengths, *asked, self.capture_mm, self.outlier)):
             raise BadInput("section settings: a length is not a positive number")
+        if not self.band_mm <= self.widest_band_mm:
+            raise BadInput("section settings: the widest band is narrower than the narrowest")
         if not self.wave_mm[0] < self.wave_mm[1]:
             raise BadInput("section settings: the shortest wave is not shorter than the longest")
 
@@ -91,6 +103,8 @@ class Chart:
     z_mm: Floats  # (2 k + 1,), ascending
     nodes_mm: Floats  # (2 k + 1, NODES, 2)
     trusted: Bools  # (k, NODES) the parabola holds: not so in a tip's rounding
+    curves: Floats  # (k, NODES, 6) these parabolas, as `project` takes them
+    growth_of_nodes: Floats  # (2 k + 1, NODES) mm outward per mm of height
     here: int  # the layer of the section itself
     arc_mm: Floats  # (NODES + 1,) along the section itself, closed
     side: Ints  # (NODES,) as in `NominalSection`: 0 leading edge, 1 suction, 2 trailing edge, 3 pressure
@@ -113,7 +127,7 @@ class Chart:
     def project(self, points_mm: Floats) -> Floats:
         """Node coordinate, signed in-plane distance and outward normal of (n, 3) points: (n, 4)."""
         points = np.ascontiguousarray(points_mm)
-        return project(points, self.z_mm, self.nodes_mm, self.seeds, self.corner_mm, self.cell_mm)
+        return project(points, self.z_mm, self.curves, self.seeds, self.corner_mm, self.cell_mm)
 
     def growth(self) -> Floats:
         """How the nodes move with z at the section itself, (NODES, 2) mm per mm."""
@@ -121,18 +135,9 @@ class Chart:
         growth: Floats = (self.nodes_mm[high] - self.nodes_mm[low]) / (self.z_mm[high] - self.z_mm[low])
         return growth
 
-    def upright(self, node: Floats, z_mm: Floats, steepest: float) -> tuple[Floats, Bools]:
-        """Steepness of the nominal, mm outward per mm of height, at points of the chart; and which are good.
-
-        Good: not steeper than `steepest`, and where the chart is trusted.
-        """
-        normals = np.stack([outward_normals(curve) for curve in self.nodes_mm])
-        growth = (np.gradient(self.nodes_mm, self.z_mm, axis=0) * normals).sum(axis=2)
-        layer = np.interp(z_mm, self.z_mm, np.arange(len(self.z_mm), dtype=np.float64))
-        at = node.astype(np.int64)
-        steepness = growth[np.rint(layer).astype(np.int64), at]
-        trusted = self.trusted[np.minimum(layer.astype(np.int64) // 2, len(self.trusted) - 1), at]
-        return steepness, trusted & (np.abs(steepness) <= steepest)
+    def steepness(self, node: Floats, z_mm: Floats) -> Floats:
+        """Steepness of the nominal, mm outward per mm of height, at points of the chart; NaN: unknown."""
+        return steepness(node, z_mm, self.z_mm, self.growth_of_nodes, self.trusted)
 
     def arc_at(self, node: Floats) -> Floats:
         """Arc length on the section of node coordinates."""
@@ -161,12 +166,14 @@ def unroll(nominal: Nominal, z_mm: float, reach_mm: float, settings: SectionSett
     heights = [float(low), *(height for three in threes for height in three.above_mm)]
     nodes = np.stack([nodes_at(height) for height in heights])
     here = heights.index(z_mm)
-    seeds, corner, cell = _seeds(nodes[here])
+    seeds, corner, cell = _seeds(nodes, here)
     arc = np.concatenate([[0.0], np.cumsum(_lengths(nodes[here]))])
     return Chart(
         z_mm=np.array(heights),
         nodes_mm=nodes,
         trusted=np.stack([three.wrong_mm <= settings.blend_limit_mm for three in threes]),
+        curves=_parabolas(nodes),
+        growth_of_nodes=_growth(np.array(heights), nodes),
         here=here,
         arc_mm=arc,
         side=_sides(nominal.section(z_mm), nodes[here]),
@@ -180,6 +187,32 @@ def outward_normals(curve_mm: Floats) -> Floats:
     """Unit outward normals (m, 2) of a closed counter-clockwise curve, from each node's neighbours."""
     along = np.roll(curve_mm, -1, axis=0) - np.roll(curve_mm, 1, axis=0)
     return np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+
+
+def _parabolas(nodes_mm: Floats) -> Floats:
+    """The parabola in height of every node over each three sections: place, slope and bend, (k, NODES, 6)."""
+    low, middle, high = nodes_mm[:-1:2], nodes_mm[1::2], nodes_mm[2::2]
+    return np.ascontiguousarray(
+        np.concatenate([low, 4.0 * middle - 3.0 * low - high, 2.0 * (low + high) - 4.0 * middle], axis=2)
+    )
+
+
+def _growth(z_mm: Floats, nodes_mm: Floats) -> Floats:
+    """How far every node moves along its normal with height, (2 k + 1, NODES)."""
+    normals = np.stack([outward_normals(curve) for curve in nodes_mm])
+    growth: Floats = (np.gradient(nodes_mm, z_mm, axis=0) * normals).sum(axis=2)
+    return growth
+
+
+def curvature(curve_mm: Floats) -> Floats:
+    """Curvature (m,) at the nodes of a closed counter-clockwise curve, 1 / mm, positive where it bulges.
+
+    Over five nodes, so that the corners of a coarse nominal polygon do not stand out.
+    """
+    one, other = curve_mm - np.roll(curve_mm, 2, axis=0), np.roll(curve_mm, -2, axis=0) - curve_mm
+    cross = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
+    sizes = (np.linalg.norm(each, axis=1) for each in (one, other, one + other))
+    return 2.0 * cross / np.prod(list(sizes), axis=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -249,22 +282,24 @@ def _sides(section: NominalSection, nodes_mm: Floats) -> Ints:
     return section.side[cKDTree(section.curve_mm).query(nodes_mm)[1]]
 
 
-def _seeds(curve_mm: Floats) -> tuple[Ints, Floats, float]:
+def _seeds(nodes_mm: Floats, here: int) -> tuple[Ints, Floats, float]:
     """For each cell of a grid over the section the nearest node, and the one on the other side if near too.
 
-    Near: within what a cell and the twist of the band can hide.
+    Near: within what the size of a cell and the movement of the nodes over the band can hide.
     """
-    cell, margin, doubt = 1.0, 2.0, 3.5
-    corner = curve_mm.min(axis=0) - margin
-    count = np.ceil((curve_mm.max(axis=0) + margin - corner) / cell).astype(np.int64)
+    curve = nodes_mm[here]
+    cell, margin, moves = 0.5, 2.0, nodes_mm - curve
+    doubt = 2.0 * (cell * np.sqrt(0.5) + float(np.abs((moves * outward_normals(curve)).sum(axis=2)).max()))
+    corner = curve.min(axis=0) - margin
+    count = np.ceil((curve.max(axis=0) + margin - corner) / cell).astype(np.int64)
     at = corner + cell * (np.indices(tuple(count)).reshape(2, -1).T + 0.5)
     half = NODES // 2
-    away, near = np.transpose([cKDTree(curve_mm[i : i + half]).query(at) for i in (0, half)], (1, 2, 0))
+    away, near = np.transpose([cKDTree(curve[i : i + half]).query(at) for i in (0, half)], (1, 2, 0))
     nodes = near.astype(np.int64) + np.array([0, half])
     first = np.argmin(away, axis=1)
-    here = np.arange(len(at))
-    other = np.where(away[here, 1 - first] - away[here, first] < doubt, nodes[here, 1 - first], -1)
-    return np.column_stack([nodes[here, first], other]).reshape(*count, 2), corner, cell
+    rows = np.arange(len(at))
+    other = np.where(away[rows, 1 - first] - away[rows, first] < doubt, nodes[rows, 1 - first], -1)
+    return np.column_stack([nodes[rows, first], other]).reshape(*count, 2), corner, cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -276,17 +311,10 @@ class Motion:
     rest: Floats  # (3,)
     per_mm: Floats  # (3,)
 
-    def at(self, z_mm: Floats) -> Floats:
-        return self.rest + np.multiply.outer(z_mm - self.z_mm, self.per_mm)
-
     def undo(self, points_mm: Floats) -> Floats:
         """Points (n, 3) taken back onto the nominal."""
-        move = self.at(points_mm[:, 2])
-        x, y = (points_mm[:, :2] - self.pivot_mm - move[:, :2]).T
-        c, s = np.cos(move[:, 2]), np.sin(move[:, 2])
-        return np.column_stack(
-            [c * x + s * y + self.pivot_mm[0], c * y - s * x + self.pivot_mm[1], points_mm[:, 2]]
-        )
+        points = np.ascontiguousarray(points_mm)
+        return undo_motion(points, self.pivot_mm, self.z_mm, self.rest, self.per_mm)
 
     def do(self, curve_mm: Floats) -> Floats:
         """A curve (m, 2) of the section itself, taken onto the part."""

@@ -33,7 +33,8 @@ def touch(curve_mm: Floats, node: int, direction: Floats) -> Contact:
     points = curve_mm[near]
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     arc -= arc[8]
-    inverse = np.linalg.pinv(np.vander(arc, 3, increasing=True))
+    basis = np.column_stack([np.ones(17), arc, arc * arc])
+    inverse = np.linalg.solve(basis.T @ basis, basis.T)
     _, linear, square = inverse @ (points @ direction)
     curvature = -2.0 * float(square)
     reach = float(arc[-1])

@@ -8,11 +8,11 @@ of every node along the outward normal, from which a sigma is propagated.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from geometry.chart import outward_normals
 from geometry.errors import CannotMeasure
 from geometry.kernels.airfoil import inscribed_circles
+from geometry.kernels.profile import nearest_nodes
 from geometry.types import Floats, Ints
 
 
@@ -61,19 +61,19 @@ def centroid_gradient(curve_mm: Floats) -> Floats:
 def orientation(curve_mm: Floats, nominal_mm: Floats) -> Estimate:
     """Turn (rad) counter-clockwise that takes the nominal onto the curve, once they share a centroid.
 
-    Best fit: the turn of least squared distance to the nominal, every mm of arc weighing the same.
+    Best fit: the turn of least squared distance to the nominal, every mm of arc weighing the same. The
+    nodes of the two correspond, at least roughly: from there the nearest one is sought.
     Source: thesis 4.4.2, after Khameneifar and Feng (its reference 6).
     """
     normals = outward_normals(nominal_mm)
     home = centroid(nominal_mm)
-    tree = cKDTree(nominal_mm)
     weight = node_shares(curve_mm)
     arm = curve_mm - centroid(curve_mm)
     turn = 0.0
     for _ in range(10):
         c, s = np.cos(turn), np.sin(turn)
         back = home + arm @ np.array([[c, -s], [s, c]])
-        near = tree.query(back)[1]
+        near = nearest_nodes(back, nominal_mm)
         n = normals[near]
         lever = n[:, 1] * (back[:, 0] - home[0]) - n[:, 0] * (back[:, 1] - home[1])
         distance = ((back - nominal_mm[near]) * n).sum(axis=1)

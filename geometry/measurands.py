@@ -7,13 +7,13 @@ support has a gap there is no number.
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from geometry.camber import max_camber, thickest_at
 from geometry.chart import SectionSettings
-from geometry.chords import chord, hollow, nose_tail_chord, tangent_chord
+from geometry.chords import Chord, Line, chord, hollow, nose_tail_chord, tangent_chord
 from geometry.curve import (
     CamberLine,
     Edge,
@@ -84,7 +84,25 @@ def section_measurands(settings: SectionSettings) -> Mapping[str, Unit]:
 
 SECTION_MEASURANDS = section_measurands(SectionSettings())
 
-Shape = Callable[[Floats], Estimate]
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn:
+    """A curve with the lines that several measurands share, drawn when the first of them asks."""
+
+    curve_mm: Floats
+    le: Edge
+    te: Edge
+
+    @cached_property
+    def caliper(self) -> Chord:
+        return chord(self.curve_mm, self.le, self.te)
+
+    @cached_property
+    def nose_tail(self) -> Line:
+        return nose_tail_chord(self.curve_mm, self.le, self.te)
+
+
+Shape = Callable[[Drawn], Estimate]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,11 +157,9 @@ def define(nominal_mm: Floats, side: Ints, settings: SectionSettings) -> Definit
     le, te = edge(nominal_mm, nose), edge(nominal_mm, 0)
     thick = _thick(nominal_mm, le, te, camber_line(nominal_mm, nose), settings)
     shapes = {**_chords(nominal_mm, le, te), **_edges(nominal_mm, le, te, settings), **_thicknesses(thick)}
-    shapes["max_thickness_position_mm"] = lambda c: thickest_at(
-        c, thick["max_thickness_mm"], nose_tail_chord(c, le, te)
-    )
-    shapes["max_camber_mm"] = lambda c: max_camber(c, camber_line(c, nose), nose_tail_chord(c, le, te))
-    shapes["centroid_x_mm"], shapes["centroid_y_mm"] = partial(_centroid, axis=0), partial(_centroid, axis=1)
+    shapes["max_camber_mm"] = lambda d: max_camber(d.curve_mm, camber_line(d.curve_mm, nose), d.nose_tail)
+    drawn = Drawn(curve_mm=nominal_mm, le=le, te=te)
+    own = {name: estimate.value for name, estimate in _estimates(drawn, shapes, shapes).items()}
     against = (n for n in section_measurands(settings) if n.startswith(_AGAINST) or "profile" in n)
     share = node_shares(nominal_mm)
     return Definition(
@@ -155,24 +171,20 @@ def define(nominal_mm: Floats, side: Ints, settings: SectionSettings) -> Definit
         waves=wave_band(node_arc(nominal_mm), share, settings.wave_mm),
         settings=settings,
         shapes=shapes,
-        nominals={**dict.fromkeys(against, 0.0), **_values(nominal_mm, shapes)},
+        nominals={**dict.fromkeys(against, 0.0), **own},
     )
 
 
 _AGAINST = ("position", "orientation", "waviness", "out_of_tolerance", "fit")
 
 
-def _values(curve_mm: Floats, shapes: Mapping[str, Shape]) -> Mapping[str, float]:
-    return {name: estimate.value for name, estimate in _estimates(curve_mm, shapes, shapes).items()}
-
-
-def _estimates(curve_mm: Floats, shapes: Mapping[str, Shape], wanted: Collection[str]) -> dict[str, Estimate]:
+def _estimates(drawn: Drawn, shapes: Mapping[str, Shape], wanted: Collection[str]) -> dict[str, Estimate]:
     """The estimates of the shapes that are wanted and that the curve has."""
     found = {}
     for name, measure in shapes.items():
         if name in wanted:
             try:
-                found[name] = measure(curve_mm)
+                found[name] = measure(drawn)
             except CannotMeasure:
                 continue
     return found
@@ -195,39 +207,60 @@ def _thick(
 
 
 def _thicknesses(thick: Mapping[str, Pair]) -> dict[str, Shape]:
-    return {name: partial(thickness, pair=pair) for name, pair in thick.items()}
+    shapes: dict[str, Shape] = {name: partial(_thickness, pair=pair) for name, pair in thick.items()}
+    largest = thick["max_thickness_mm"]
+    return {**shapes, "max_thickness_position_mm": lambda d: thickest_at(d.curve_mm, largest, d.nose_tail)}
+
+
+def _thickness(drawn: Drawn, pair: Pair) -> Estimate:
+    return thickness(drawn.curve_mm, pair)
 
 
 def _chords(nominal_mm: Floats, le: Edge, te: Edge) -> dict[str, Shape]:
     shapes: dict[str, Shape] = {
-        "chord_mm": lambda c: chord(c, le, te).line.length,
-        "stagger_deg": lambda c: _degrees(chord(c, le, te).stagger),
-        "chord_nose_tail_mm": lambda c: nose_tail_chord(c, le, te).length,
+        "chord_mm": lambda d: d.caliper.line.length,
+        "stagger_deg": lambda d: _degrees(d.caliper.stagger),
+        "chord_nose_tail_mm": lambda d: d.nose_tail.length,
+        "centroid_x_mm": partial(_centroid, axis=0),
+        "centroid_y_mm": partial(_centroid, axis=1),
     }
     try:
         down = hollow(nominal_mm, le, te)
     except CannotMeasure:
         return shapes
-    return {**shapes, "chord_tangent_mm": lambda c: tangent_chord(c, le, te, down)}
+    return {**shapes, "chord_tangent_mm": lambda d: tangent_chord(d.curve_mm, le, te, down)}
 
 
 def _edges(nominal_mm: Floats, le: Edge, te: Edge, settings: SectionSettings) -> dict[str, Shape]:
-    """Radius, flat and smallest radius of both edges; the window of the last is half the nominal radius."""
+    """Radius, flat and smallest radius of both edges; the last over as much arc as the nominal radius."""
     shapes: dict[str, Shape] = {}
     for name, end in (("le", le), ("te", te)):
-        shapes[f"{name}_radius_mm"] = partial(edge_radius, arc=end.arc)
-        shapes[f"{name}_flat_mm"] = partial(flat, end=end, flat_mm=settings.flat_mm)
+        shapes[f"{name}_radius_mm"] = partial(_edge_radius, end=end)
+        shapes[f"{name}_flat_mm"] = partial(_flat, end=end, flat_mm=settings.flat_mm)
         try:
-            window = edge_radius(nominal_mm, end.arc).value
+            window_mm = edge_radius(nominal_mm, end.arc).value
         except CannotMeasure:
             continue
-        shapes[f"{name}_min_radius_mm"] = partial(min_radius, end=end, window_mm=window)
+        shapes[f"{name}_min_radius_mm"] = partial(_min_radius, end=end, window_mm=window_mm)
     return shapes
 
 
-def _centroid(curve_mm: Floats, axis: int) -> Estimate:
+def _edge_radius(drawn: Drawn, end: Edge) -> Estimate:
+    return edge_radius(drawn.curve_mm, end.arc)
+
+
+def _flat(drawn: Drawn, end: Edge, flat_mm: float) -> Estimate:
+    return flat(drawn.curve_mm, end, flat_mm)
+
+
+def _min_radius(drawn: Drawn, end: Edge, window_mm: float) -> Estimate:
+    return min_radius(drawn.curve_mm, end, window_mm)
+
+
+def _centroid(drawn: Drawn, axis: int) -> Estimate:
     """One coordinate of the centroid."""
-    return Estimate(value=float(centroid(curve_mm)[axis]), gradient=centroid_gradient(curve_mm)[axis])
+    gradient = centroid_gradient(drawn.curve_mm)[axis]
+    return Estimate(value=float(centroid(drawn.curve_mm)[axis]), gradient=gradient)
 
 
 def _degrees(angle: Estimate) -> Estimate:
@@ -238,7 +271,8 @@ def shape(
     curve_mm: Floats, definition: Definition, wanted: Collection[str] | None = None
 ) -> dict[str, Estimate]:
     """The estimates that need one curve only, by name: those `wanted`, or all."""
-    return _estimates(curve_mm, definition.shapes, definition.shapes if wanted is None else wanted)
+    drawn = Drawn(curve_mm=curve_mm, le=definition.le, te=definition.te)
+    return _estimates(drawn, definition.shapes, definition.shapes if wanted is None else wanted)
 
 
 def place(curve_mm: Floats, nominal_mm: Floats) -> dict[str, Estimate]:

@@ -1,97 +1,29 @@
 """Cloud near a plane -> the reconstructed section profile, with its covariance and its gaps.
 
 The profile is the nominal section, moved rigidly as the part was, plus a smooth deviation along its
-normals. The deviation is a cubic tensor spline over arc length and a band of neighbouring z, penalised
-by its curvature in both directions; how strongly is estimated from the data (restricted maximum
-likelihood), apart for the edges, which erode, and the sides. What has no points is a gap, never bridged.
+normals (`geometry.band`). What has no points is a gap, never bridged.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
 
+from geometry.band import Knots, band_of, onto_chart, robust_fit
 from geometry.chart import (
     NODES,
     Chart,
     Motion,
     SectionSettings,
-    edge_width,
+    curvature,
     find_motion,
     outward_normals,
     rigid_columns,
     unroll,
 )
 from geometry.errors import CannotMeasure
-from geometry.kernels.profile import cubic_weights
-from geometry.kernels.profile_spline import (
-    Penalty,
-    SplineFit,
-    Sums,
-    curvature_penalty,
-    fit_spline,
-    gather,
-    solve,
-)
+from geometry.kernels.profile_spline import SplineFit
 from geometry.nominal import Nominal
 from geometry.types import Bools, Floats, Ints
-
-_PILOT_POINTS = 20_000  # of a band, to tell outliers
-_BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # a start: curvature of sides, of edges, along the span
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Knots:
-    """Where the deviation spline of one band has its coefficients: p along the arc, q across."""
-
-    p: int
-    q: int
-    low_mm: float
-    step_mm: float
-
-    def u(self, node: Floats) -> Floats:
-        """Knot spans of node coordinates."""
-        return node * (self.p / NODES) % self.p
-
-    def v(self, z_mm: Floats) -> Floats:
-        """Knot spans of heights."""
-        return (z_mm - self.low_mm) / self.step_mm
-
-    def weights(self, gradients: Floats, z_mm: float) -> Floats:
-        """Weights (p, q, n) of the coefficients in n functions (n, NODES) of the node displacements."""
-        u = self.u(np.arange(NODES, dtype=np.float64))
-        span = u.astype(np.int64)
-        column = (span[:, None] + np.arange(4)) % self.p
-        row = np.repeat(np.arange(NODES), 4)
-        basis = csr_array((cubic_weights(u, span).ravel(), (row, column.ravel())), shape=(NODES, self.p))
-        along = basis.T @ gradients.T
-        v = self.v(np.array([z_mm]))
-        first = np.clip(v.astype(np.int64), 0, self.q - 4)
-        across = np.zeros(self.q)
-        across[first[0] : first[0] + 4] = cubic_weights(v, first)[0]
-        weights: Floats = along[:, None, :] * across[:, None]
-        return weights
-
-
-def place_knots(chart: Chart, settings: SectionSettings) -> Knots:
-    """Knots that crowd at the edges as the nodes do, `knot_mm` apart on the sides."""
-    half = chart.perimeter_mm / 2.0
-    refined = half + 1.77 * (settings.edge_refinement - 1.0) * edge_width(half, settings)
-    p = 2 * max(8, round(refined / settings.knot_mm))
-    low, high = float(chart.z_mm[0]), float(chart.z_mm[-1])
-    spans = max(1, round((high - low) / settings.z_knot_mm))
-    return Knots(p=min(p, NODES // 4), q=spans + 3, low_mm=low, step_mm=(high - low) / spans)
-
-
-def _penalty(chart: Chart, knots: Knots, settings: SectionSettings) -> Penalty:
-    """Curvature along the arc, apart for sides (0) and edges (1), and across."""
-    spans = np.arange(knots.p, dtype=np.float64)
-    centre = chart.arc_at((spans - 1.0) % knots.p * (NODES / knots.p))
-    leading = chart.arc_mm[NODES // 2]
-    trailing = np.minimum(centre, chart.perimeter_mm - centre)
-    reach = 1.5 * edge_width(chart.perimeter_mm / 2.0, settings)
-    group = (np.minimum(np.abs(centre - leading), trailing) < reach).astype(np.int64)
-    return curvature_penalty(centre, chart.perimeter_mm, group, knots.q, knots.step_mm)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,46 +93,22 @@ class Scan:
     mask: Bools  # (n,) True = damaged
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Band:
-    """Sound points near a section, taken back onto the chart."""
-
-    node: Floats  # (n,) node coordinate
-    z_mm: Floats
-    deviation_mm: Floats
-    sigma_mm: Floats
-    columns: Floats  # (n, 6) the rigid part
-
-    def sums(self, keep: Bools, knots: Knots, penalty: Penalty) -> Sums:
-        """Weighted sums of some points, with a weak prior on the rigid part: `find_motion` has taken most."""
-        u, v = knots.u(self.node[keep]), knots.v(self.z_mm[keep])
-        weight = self.sigma_mm[keep] ** -2.0
-        sums = gather(u, v, self.deviation_mm[keep], weight, self.columns[keep], penalty.layout)
-        return replace(sums, free=sums.free + np.diag(np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0))
-
-    def residual(self, fit: SplineFit, knots: Knots) -> Floats:
-        """Distance from the fit in units of each point's sigma."""
-        fitted = fit.values(knots.u(self.node), knots.v(self.z_mm), self.columns)
-        residual: Floats = np.abs(self.deviation_mm - fitted) / self.sigma_mm
-        return residual
-
-
 def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     """The profile in the chart's plane. Damaged points take no part.
 
     Raises `CannotMeasure` when too few sound points lie near the plane.
     """
     z = scan.points_mm[:, 2]
-    inside = (z >= chart.z_mm[0]) & (z <= chart.z_mm[-1]) & ~scan.mask
+    low, high = band_of(chart, z[~scan.mask], settings)
+    inside = (z >= low) & (z <= high) & ~scan.mask
     if np.count_nonzero(inside) < settings.min_points:
         raise CannotMeasure(f"no sound points within {settings.band_mm:g} mm of the plane")
     sound = scan.points_mm[inside]
     motion = find_motion(chart, sound)
-    band = _onto_chart(sound, scan.sigma_mm[inside], chart, motion, settings)
+    band = onto_chart(sound, scan.sigma_mm[inside], chart, motion, settings)
     if len(band.node) < settings.min_points:
         raise CannotMeasure("no sound points near the nominal section")
-    knots = place_knots(chart, settings)
-    keep, fit = _robust_fit(band, knots, _penalty(chart, knots, settings), settings)
+    keep, knots, fit = robust_fit(band, chart, (low, high), settings)
     near = np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0
     arc = _supporting(chart.arc_at(band.node[near]), keep[near], settings.max_gap_mm)
     profile = _profile(chart, motion, knots, fit, float(np.median(band.sigma_mm)))
@@ -211,50 +119,17 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     )
 
 
-def _onto_chart(
-    points_mm: Floats, sigma_mm: Floats, chart: Chart, motion: Motion, settings: SectionSettings
-) -> Band:
-    """The points within `capture_mm` of the moved nominal, where it stands upright enough.
-
-    On a slanted surface the distance in the plane is longer than along the normal, and so is its sigma.
-    """
-    back = motion.undo(points_mm)
-    foot = chart.project(back)
-    steepness, upright = chart.upright(foot[:, 0], back[:, 2], settings.steepest)
-    near = upright & (np.abs(foot[:, 1]) <= settings.capture_mm)
-    height = (back[near, 2] - chart.section_z_mm) / settings.band_mm
-    return Band(
-        node=foot[near, 0],
-        z_mm=back[near, 2],
-        deviation_mm=foot[near, 1],
-        sigma_mm=sigma_mm[near] * np.hypot(1.0, steepness[near]),
-        columns=rigid_columns(back[near], foot[near, 2:], motion.pivot_mm, height),
-    )
-
-
-def _robust_fit(
-    band: Band, knots: Knots, penalty: Penalty, settings: SectionSettings
-) -> tuple[Bools, SplineFit]:
-    """Which points the profile passes through, and the fit to them.
-
-    What is kept is decided on a share of the points and a fixed smoothness; the last fit takes them all.
-    """
-    start = _BENDING_PER_MM**-2.0
-    some = np.zeros(len(band.node), bool)
-    some[:: max(1, len(some) // _PILOT_POINTS)] = True
-    keep = np.ones_like(some)
-    for limit in (2.0 * settings.outlier, settings.outlier):
-        residual = band.residual(solve(band.sums(keep & some, knots, penalty), penalty, start), knots)
-        keep = residual <= limit * 1.4826 * np.median(residual)
-    return keep, fit_spline(band.sums(keep, knots, penalty), penalty, start)
-
-
 def _profile(chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, sigma_mm: float) -> Profile:
-    """The curve of a fit, taken back to where the part is; its gaps are not known yet."""
+    """The curve of a fit, taken back to where the part is; its gaps are not known yet.
+
+    Noise along the surface lifts points off a bent one by half its variance over the radius: taken off again.
+    """
     normals = outward_normals(chart.curve_mm)
     columns = rigid_columns(chart.curve_mm, normals, motion.pivot_mm, np.zeros(NODES))
     height = np.full(NODES, chart.section_z_mm)
     deviation = fit.values(knots.u(np.arange(NODES, dtype=np.float64)), knots.v(height), columns)
+    noise_mm = float(np.sqrt(fit.scale)) * sigma_mm
+    deviation = deviation - 0.5 * noise_mm**2 * curvature(chart.curve_mm)
     curve = motion.do(chart.curve_mm + normals * deviation[:, None])
     return Profile(
         chart=chart,
@@ -262,7 +137,7 @@ def _profile(chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, sigma_m
         deviation_mm=chart.project(np.column_stack([curve, height]))[:, 1],
         gaps=(),
         zones=(),
-        noise_mm=float(np.sqrt(fit.scale)) * sigma_mm,
+        noise_mm=noise_mm,
         knots=knots,
         fit=fit,
         columns=columns,

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from geometry.chart import FitSettings, Freedom, outward_normals
 from geometry.curve import Estimate, centroid, node_shares
+from geometry.kernels.profile import nearest_nodes
 from geometry.types import Floats, Ints
 
 _FREEDOMS: tuple[Freedom, ...] = ("x", "y", "rotation")
@@ -42,13 +42,13 @@ def best_fit(curve_mm: Floats, nominal_mm: Floats, side: Ints, settings: FitSett
     `side` (m,) as in `NominalSection`. What is locked does not move. Distances are along the normals of the
     nominal (point to plane).
     """
-    home, tree, normals = centroid(nominal_mm), cKDTree(nominal_mm), outward_normals(nominal_mm)
+    home, normals = centroid(nominal_mm), outward_normals(nominal_mm)
     weight = node_shares(curve_mm) * settings.weights[side]
     free = np.array([name not in settings.locked for name in _FREEDOMS])
     motion = np.zeros(3)
     for _ in range(12):
         back = _undo(curve_mm, home, motion)
-        near = tree.query(back)[1]
+        near = nearest_nodes(back, nominal_mm)
         distance = ((back - nominal_mm[near]) * normals[near]).sum(axis=1)
         columns = _columns(back - home, normals[near])
         pull = np.zeros((3, len(curve_mm)))

@@ -5,53 +5,69 @@ import math
 import numpy as np
 from numba import njit
 
-from geometry.types import Floats, Ints
+from geometry.types import Bools, Floats, Ints
 
 
 @njit(cache=True, nogil=True)
-def _node(nodes_mm: Floats, layer: int, up: float, j: int) -> tuple[float, float]:
-    """Node `j` of the curve at the fraction `up` between `layer` and the next one but one: a parabola."""
-    a = (1.0 - up) * (1.0 - 2.0 * up)
-    b = 4.0 * up * (1.0 - up)
-    c = up * (2.0 * up - 1.0)
-    low, middle, high = nodes_mm[layer, j], nodes_mm[layer + 1, j], nodes_mm[layer + 2, j]
-    return a * low[0] + b * middle[0] + c * high[0], a * low[1] + b * middle[1] + c * high[1]
+def _wrap(j: int, m: int) -> int:
+    """`j` in [0, m) for -m <= j < 2 m; a division is slower than all else that is done to a node."""
+    if j >= m:
+        return j - m
+    return j + m if j < 0 else j
 
 
 @njit(cache=True, nogil=True)
-def _descend(nodes_mm: Floats, layer: int, up: float, x: float, y: float, start: int) -> tuple[int, float]:
-    """The locally nearest node, walking from `start` with shrinking strides, and its squared distance."""
-    m = nodes_mm.shape[1]
+def _node(curves: Floats, three: int, up: float, j: int) -> tuple[float, float]:
+    """Node `j` of the curve at the fraction `up` of the interval `three`: a parabola in height."""
+    c = curves[three, j]
+    return c[0] + up * (c[2] + up * c[4]), c[1] + up * (c[3] + up * c[5])
+
+
+@njit(cache=True, nogil=True)
+def _descend(curves: Floats, three: int, up: float, x: float, y: float, start: int) -> tuple[int, float]:
+    """The locally nearest node, by a jump along the tangent at `start` and then step by step; distance^2."""
+    m = curves.shape[1]
     j = start
-    nx, ny = _node(nodes_mm, layer, up, j)
+    nx, ny = _node(curves, three, up, j)
     best = (nx - x) ** 2 + (ny - y) ** 2
-    stride = 8
+    px, py = _node(curves, three, up, _wrap(j + 1, m))
+    ex, ey = px - nx, py - ny
+    jump = round(((x - nx) * ex + (y - ny) * ey) / (ex * ex + ey * ey + 1e-300))
+    if jump != 0:
+        k = _wrap(j + min(max(jump, -40), 40), m)
+        nx, ny = _node(curves, three, up, k)
+        d2 = (nx - x) ** 2 + (ny - y) ** 2
+        if d2 < best:
+            j, best = k, d2
+    stride = 4
     while stride >= 1:
         for direction in (stride, -stride):
             while True:
-                k = (j + direction) % m
-                nx, ny = _node(nodes_mm, layer, up, k)
+                k = _wrap(j + direction, m)
+                nx, ny = _node(curves, three, up, k)
                 d2 = (nx - x) ** 2 + (ny - y) ** 2
                 if d2 >= best:
                     break
                 j, best = k, d2
-        stride //= 2
+        stride //= 4
     return j, best
 
 
 @njit(cache=True, nogil=True)
 def _foot(
-    nodes_mm: Floats, layer: int, up: float, x: float, y: float, j: int
+    curves: Floats, three: int, up: float, x: float, y: float, j: int
 ) -> tuple[float, float, float, float]:
     """Foot on the two segments that meet in node `j`: node coordinate, signed distance, outward normal."""
-    m = nodes_mm.shape[1]
-    cx, cy = _node(nodes_mm, layer, up, j)
+    m = curves.shape[1]
+    cx, cy = _node(curves, three, up, j)
+    lx, ly = _node(curves, three, up, _wrap(j - 1, m))
+    rx, ry = _node(curves, three, up, _wrap(j + 1, m))
     best = math.inf
     foot = 0.0
     fx = fy = nx = ny = 0.0
     for side in (-1, 0):
-        ax, ay = _node(nodes_mm, layer, up, (j + side) % m)
-        bx, by = _node(nodes_mm, layer, up, (j + side + 1) % m)
+        ax, ay = (lx, ly) if side < 0 else (cx, cy)
+        bx, by = (cx, cy) if side < 0 else (rx, ry)
         ex, ey = bx - ax, by - ay
         length2 = ex * ex + ey * ey + 1e-300
         f = min(1.0, max(0.0, ((x - ax) * ex + (y - ay) * ey) / length2))
@@ -62,10 +78,8 @@ def _foot(
             best, foot, fx, fy = d2, j + side + f, qx, qy
             nx, ny = ey / length, -ex / length
     if fx == cx and fy == cy:  # on the node itself: the mean normal decides inside and outside
-        ax, ay = _node(nodes_mm, layer, up, (j - 1) % m)
-        bx, by = _node(nodes_mm, layer, up, (j + 1) % m)
-        length = math.hypot(bx - ax, by - ay) + 1e-300
-        nx, ny = (by - ay) / length, (ax - bx) / length
+        length = math.hypot(rx - lx, ry - ly) + 1e-300
+        nx, ny = (ry - ly) / length, (lx - rx) / length
     distance = math.sqrt(best)
     if (x - fx) * nx + (y - fy) * ny < 0.0:
         distance = -distance
@@ -74,28 +88,79 @@ def _foot(
 
 @njit(cache=True, nogil=True)
 def project(
-    points_mm: Floats, z_mm: Floats, nodes_mm: Floats, seeds: Ints, corner_mm: Floats, cell_mm: float
+    points_mm: Floats, z_mm: Floats, curves: Floats, seeds: Ints, corner_mm: Floats, cell_mm: float
 ) -> Floats:
     """(n, 4) of every point: node coordinate in [0, m), signed in-plane distance, outward normal x, y.
 
-    `nodes_mm` (2 k + 1, m, 2) are counter-clockwise curves at the heights `z_mm` (2 k + 1,) whose nodes
-    correspond; every odd one lies halfway between its neighbours, and a parabola in height blends the
-    three. `seeds` (nx, ny, 2) name for each cell a start node and, where the other side of the airfoil may
-    be as near, one there, else -1.
+    `curves` (k, m, 6) are counter-clockwise curves whose nodes correspond, one for each interval of height
+    between the even ones of `z_mm` (2 k + 1,): x, y, their slope and their bend over the interval.
+    `seeds` (nx, ny, 2) name for each cell a start node and, where the other side of the airfoil may be as
+    near, one there, else -1.
     """
     out = np.empty((len(points_mm), 4))
     for i in range(len(points_mm)):
         x, y, z = points_mm[i]
-        layer = min(max(np.searchsorted(z_mm, z, side="right") - 1, 0), len(z_mm) - 3) // 2 * 2
-        up = (z - z_mm[layer]) / (z_mm[layer + 2] - z_mm[layer])
+        three = min(max(np.searchsorted(z_mm, z, side="right") - 1, 0), len(z_mm) - 3) // 2
+        up = (z - z_mm[2 * three]) / (z_mm[2 * three + 2] - z_mm[2 * three])
         cx = min(max(int((x - corner_mm[0]) / cell_mm), 0), seeds.shape[0] - 1)
         cy = min(max(int((y - corner_mm[1]) / cell_mm), 0), seeds.shape[1] - 1)
-        j, best = _descend(nodes_mm, layer, up, x, y, seeds[cx, cy, 0])
+        j, best = _descend(curves, three, up, x, y, seeds[cx, cy, 0])
         if seeds[cx, cy, 1] >= 0:
-            k, other = _descend(nodes_mm, layer, up, x, y, seeds[cx, cy, 1])
+            k, other = _descend(curves, three, up, x, y, seeds[cx, cy, 1])
             if other < best:
                 j = k
-        out[i] = _foot(nodes_mm, layer, up, x, y, j)
+        out[i] = _foot(curves, three, up, x, y, j)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def nearest_nodes(points_mm: Floats, curve_mm: Floats) -> Ints:
+    """For each point (m, 2) the locally nearest node of a closed curve (m, 2), sought from its own number."""
+    m = len(curve_mm)
+    out = np.empty(m, np.int64)
+    for i in range(m):
+        j = i
+        best = (curve_mm[i, 0] - points_mm[i, 0]) ** 2 + (curve_mm[i, 1] - points_mm[i, 1]) ** 2
+        for direction in (8, -8, 1, -1):
+            while True:
+                k = _wrap(j + direction, m)
+                d2 = (curve_mm[k, 0] - points_mm[i, 0]) ** 2 + (curve_mm[k, 1] - points_mm[i, 1]) ** 2
+                if d2 >= best:
+                    break
+                j, best = k, d2
+        out[i] = j
+    return out
+
+
+@njit(cache=True, nogil=True)
+def steepness(node: Floats, z: Floats, z_mm: Floats, growth: Floats, trusted: Bools) -> Floats:
+    """Outward growth (n,) of a surface with height at the nearest curve of `project`; NaN where not trusted.
+
+    `growth` (2 k + 1, m) at the nodes, `trusted` (k, m) for each parabola.
+    """
+    out = np.empty(len(node))
+    for i in range(len(node)):
+        three = min(max(np.searchsorted(z_mm, z[i], side="right") - 1, 0), len(z_mm) - 3) // 2
+        layer = 2 * three
+        up = (z[i] - z_mm[layer]) / (z_mm[layer + 2] - z_mm[layer])
+        j = int(node[i])
+        near = layer + (0 if up < 0.25 else (1 if up < 0.75 else 2))
+        out[i] = growth[near, j] if trusted[three, j] else math.nan
+    return out
+
+
+@njit(cache=True, nogil=True)
+def undo_motion(points_mm: Floats, pivot_mm: Floats, z_mm: float, rest: Floats, per_mm: Floats) -> Floats:
+    """Points (n, 3) taken back by a motion (x, y, turn) `rest` at `z_mm` that grows `per_mm` of height."""
+    out = np.empty_like(points_mm)
+    for i in range(len(points_mm)):
+        height = points_mm[i, 2] - z_mm
+        x = points_mm[i, 0] - pivot_mm[0] - rest[0] - per_mm[0] * height
+        y = points_mm[i, 1] - pivot_mm[1] - rest[1] - per_mm[1] * height
+        turn = rest[2] + per_mm[2] * height
+        c, s = math.cos(turn), math.sin(turn)
+        out[i, 0], out[i, 1] = c * x + s * y + pivot_mm[0], c * y - s * x + pivot_mm[1]
+        out[i, 2] = points_mm[i, 2]
     return out
 
 
@@ -134,7 +199,7 @@ def tensor_sums(
         _cubic(u[n] - i0, bu)
         _cubic(v[n] - k0, bv)
         for a in range(4):
-            i = (i0 + a) % p
+            i = _wrap(i0 + a, p)
             wa = weight[n] * bu[a]
             for k in range(4):
                 wak = wa * bv[k]
@@ -164,7 +229,7 @@ def tensor_values(u: Floats, v: Floats, coefficients: Floats) -> Floats:
         value = 0.0
         for a in range(4):
             for k in range(4):
-                value += bu[a] * bv[k] * coefficients[(i0 + a) % p, k0 + k]
+                value += bu[a] * bv[k] * coefficients[_wrap(i0 + a, p), k0 + k]
         out[n] = value
     return out
 
@@ -199,3 +264,72 @@ def cubic_weights(t: Floats, first: Ints) -> Floats:
     for n in range(len(t)):
         _cubic(t[n] - first[n], out[n])
     return out
+
+
+@njit(cache=True, nogil=True)
+def _columns(arm: Floats, normal: Floats, height: float, out: Floats) -> None:
+    """Growth (6,) of a distance with the shift x, y and turn of a section, and with their slopes."""
+    out[0], out[1] = normal[0], normal[1]
+    out[2] = normal[1] * arm[0] - normal[0] * arm[1]
+    for c in range(3):
+        out[3 + c] = out[c] * height
+
+
+@njit(cache=True, nogil=True)
+def band_misfit(u: Floats, v: Floats, rows: Floats, coefficients: Floats, free: Floats) -> Floats:
+    """Signed distance (n,) of points from a tensor spline with the rigid columns `free` (6,).
+
+    `rows` (n, 6): distance, arm x, y, normal x, y, height; `u`, `v` as in `tensor_sums`.
+    """
+    p, q = coefficients.shape
+    out = np.empty(len(u))
+    bu, bv, columns = np.empty(4), np.empty(4), np.empty(6)
+    for n in range(len(u)):
+        i0 = int(u[n])
+        k0 = min(max(int(v[n]), 0), q - 4)
+        _cubic(u[n] - i0, bu)
+        _cubic(v[n] - k0, bv)
+        _columns(rows[n, 1:3], rows[n, 3:5], rows[n, 5], columns)
+        value = 0.0
+        for c in range(6):
+            value += columns[c] * free[c]
+        for a in range(4):
+            i = _wrap(i0 + a, p)
+            for k in range(4):
+                value += bu[a] * bv[k] * coefficients[i, k0 + k]
+        out[n] = rows[n, 0] - value
+    return out
+
+
+@njit(cache=True, nogil=True)
+def band_bins(
+    u: Floats, v: Floats, rows: Floats, weight: Floats, shape: tuple[int, int], per_span: tuple[int, int]
+) -> Floats:
+    """Weighted means (k, 10) of the points in each bin that has any: u, v, weight, distance, six columns.
+
+    `shape` (p, spans) of the spline, `per_span` bins in each knot span; `rows` as in `band_misfit`. What a
+    bin blurs is of second order: half the spline's curvature times the variance of places in a bin.
+    """
+    across = shape[1] * per_span[1]
+    sums = np.zeros((shape[0] * per_span[0] * across, 10))
+    columns = np.empty(6)
+    for n in range(len(u)):
+        w = weight[n]
+        if w == 0.0:
+            continue
+        _columns(rows[n, 1:3], rows[n, 3:5], rows[n, 5], columns)
+        b = int(u[n] * per_span[0]) * across + min(max(int(v[n] * per_span[1]), 0), across - 1)
+        sums[b, 0] += w * u[n]
+        sums[b, 1] += w * v[n]
+        sums[b, 2] += w
+        sums[b, 3] += w * rows[n, 0]
+        for c in range(6):
+            sums[b, 4 + c] += w * columns[c]
+    used = 0
+    for b in range(len(sums)):
+        total = sums[b, 2]
+        if total > 0.0:
+            for c in range(10):
+                sums[used, c] = sums[b, c] if c == 2 else sums[b, c] / total
+            used += 1
+    return sums[:used].copy()

@@ -1,6 +1,6 @@
 """A penalised cubic tensor spline, periodic by open, whose smoothness its own data decide."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -174,7 +174,7 @@ class SplineFit:
     bending: Floats  # c' S c of each penalty, times its strength
     taken: Floats  # effective dimensions that each penalty takes away
     factor: Floats  # band Cholesky factor
-    cross: Floats  # (p q, e), band order
+    cross: Floats  # (p q, e), band order; more columns than `free` once functions are held
     schur: Floats  # (e, e)
 
     def values(self, u: Floats, v: Floats, columns: Floats) -> Floats:
@@ -184,40 +184,85 @@ class SplineFit:
     def covariance(self, spline: Floats, free: Floats) -> Floats:
         """Covariance (n, n) of n linear functions: weights `spline` (p, q, n) and `free` (e, n)."""
         folded = self.layout.fold(spline)
-        solved = cho_solve_banded((self.factor, True), folded)
+        solved = cho_solve_banded((self.factor, True), folded, check_finite=False)
+        free = np.vstack([free, np.zeros((self.cross.shape[1] - len(free), free.shape[1]))])
         rest = free - self.cross.T @ solved
         return self.scale * (folded.T @ solved + rest.T @ np.linalg.solve(self.schur, rest))
 
+    def held(self, weights: Floats, variance: Floats) -> "SplineFit":
+        """The fit, told that the functions `weights` (p, q, n) of the spline are 0 with a `variance` (n,).
 
-def solve(sums: Sums, penalty: Penalty, strength: Floats) -> SplineFit:
-    """The fit at given strengths of the penalties: the spline eliminated first, then the free columns."""
+        As if each had been measured to be 0 (conditioning of a Gaussian posterior): the multipliers of these
+        measurements join the free columns.
+        """
+        folded, old = self.layout.fold(weights), self.cross.shape[1]
+        solved = cho_solve_banded((self.factor, True), np.hstack([self.cross, folded]), check_finite=False)
+        cross = np.hstack([self.cross, folded])
+        schur = -cross.T @ solved
+        schur[:old, :old] = self.schur
+        schur[old:, old:] -= np.diag(variance / self.scale)
+        before = self.layout.fold(self.coefficients[:, :, None])[:, 0]
+        wrong = np.concatenate([np.zeros(old), -(folded.T @ before)])
+        step = np.linalg.solve(schur, wrong)
+        after = self.layout.unfold((before - solved @ step)[:, None])[:, :, 0]
+        free = self.free + step[: len(self.free)]
+        return replace(self, coefficients=np.ascontiguousarray(after), free=free, cross=cross, schur=schur)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solution:
+    """The normal equations solved: the spline eliminated first, then the free columns."""
+
+    factor: Floats  # band Cholesky factor
+    cross: Floats  # (p q, e), band order
+    solved: Floats  # (p q, 1 + e) of the right side and of the cross sums
+    schur: Floats  # (e, e)
+    free: Floats  # (e,)
+    folded: Floats  # (p q, 1) coefficients, band order
+
+    def values(self, layout: Stencil) -> Floats:
+        """The coefficients (p, q)."""
+        return np.ascontiguousarray(layout.unfold(self.folded)[:, :, 0])
+
+
+def eliminate(sums: Sums, penalty: Penalty, strength: Floats) -> Solution:
+    """The solution at given strengths of the penalties."""
     layout = penalty.layout
     matrix = sums.gram + penalty.matrix(strength)
     matrix[:, 0] += 1e-9 * float(np.trace(sums.gram[:, 0].mean(axis=0))) / layout.q * np.eye(layout.q)
-    factor = cholesky_banded(layout.band(matrix), lower=True)
+    factor = cholesky_banded(layout.band(matrix), lower=True, overwrite_ab=True, check_finite=False)
     right, cross = layout.fold(sums.right), layout.fold(sums.cross)
-    solved = cho_solve_banded((factor, True), np.hstack([right, cross]))
+    solved = cho_solve_banded((factor, True), np.hstack([right, cross]), check_finite=False)
     schur = sums.free - cross.T @ solved[:, 1:]
     free = np.linalg.solve(schur, sums.free_right - cross.T @ solved[:, 0]).astype(np.float64)
     folded = solved[:, :1] - solved[:, 1:] @ free[:, None]
-    coefficients = layout.unfold(folded)
+    return Solution(factor=factor, cross=cross, solved=solved, schur=schur, free=free, folded=folded)
+
+
+def solve(sums: Sums, penalty: Penalty, strength: Floats) -> SplineFit:
+    """The fit at given strengths of the penalties, with its scale and effective dimensions."""
+    layout, found = penalty.layout, eliminate(sums, penalty, strength)
+    coefficients = layout.unfold(found.folded)
     bending = strength * (penalty.times(coefficients) * coefficients).sum(axis=(1, 2, 3))
-    inverse = layout.inside(band_inverse(factor))
-    taken = strength * (penalty.traces(inverse) + _correction(penalty, layout.unfold(solved[:, 1:]), schur))
-    dimensions = layout.p * layout.q + len(free) - float(taken.sum())
-    explained = float(right[:, 0] @ folded[:, 0]) + float(sums.free_right @ free) + float(bending.sum())
-    residual = max(sums.square - explained, 1e-12 * sums.square)
+    inverse = layout.inside(band_inverse(found.factor))
+    bent = layout.unfold(found.solved[:, 1:])
+    taken = strength * (penalty.traces(inverse) + _correction(penalty, bent, found.schur))
+    dimensions = layout.p * layout.q + len(found.free) - float(taken.sum())
+    explained = float(layout.fold(sums.right)[:, 0] @ found.folded[:, 0]) + float(
+        sums.free_right @ found.free
+    )
+    residual = max(sums.square - explained - float(bending.sum()), 1e-12 * sums.square)
     return SplineFit(
         layout=layout,
         coefficients=np.ascontiguousarray(coefficients[:, :, 0]),
-        free=free,
+        free=found.free,
         scale=residual / max(sums.count - dimensions, 1.0),
         strength=strength,
         bending=bending,
         taken=taken,
-        factor=factor,
-        cross=cross,
-        schur=schur,
+        factor=found.factor,
+        cross=found.cross,
+        schur=found.schur,
     )
 
 

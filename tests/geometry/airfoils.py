@@ -52,6 +52,26 @@ class DiscAirfoil:
         return curve, (per_edge - middle - 1) + per_side + middle - 1
 
 
+def random_airfoil(rng: np.random.Generator) -> DiscAirfoil | None:
+    """Chord 10 to 100 mm, up to 25 % camber, edges from 0.3 %; None if the discs envelop no simple curve."""
+    span = 10.0 ** rng.uniform(1.0, 2.0)
+    te = span * rng.uniform(0.003, 0.02)
+    le = te * rng.uniform(1.0, 3.0)
+    airfoil = DiscAirfoil(
+        span_mm=span,
+        camber_mm=span * rng.uniform(0.0, 0.25),
+        le_mm=le,
+        te_mm=te,
+        largest_mm=max(le * 1.1, span * rng.uniform(0.02, 0.09)),
+    )
+    t = np.linspace(0.0, 1.0, 501)
+    _, radius, slope = airfoil.discs(t)
+    speed = np.hypot(span, 4.0 * airfoil.camber_mm * (1.0 - 2.0 * t))
+    bend = 8.0 * airfoil.camber_mm * span / speed**3
+    simple = np.abs(slope / speed).max() < 0.9 and (radius * bend).max() < 0.9
+    return airfoil if simple else None
+
+
 def _arc(centre: Floats, start: Floats, stop: Floats, count: int) -> Floats:
     """`count` points counter-clockwise from `start` to `stop` about `centre`."""
     a, b = (np.arctan2(*(p - centre)[::-1]) for p in (start, stop))

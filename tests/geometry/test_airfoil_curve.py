@@ -21,7 +21,7 @@ from geometry.curve import (
 )
 from geometry.errors import CannotMeasure
 from geometry.kernels.airfoil import farthest_pair, inscribed_circles
-from tests.geometry.airfoils import AnalyticNominal, Blade, DiscAirfoil
+from tests.geometry.airfoils import AnalyticNominal, Blade, DiscAirfoil, random_airfoil
 
 A, B = 20.0, 4.0
 
@@ -205,23 +205,3 @@ def test_two_thousand_airfoils_are_measured_without_a_failure():
             assert edge_radius(curve, end.arc).value == pytest.approx(radius, rel=0.01)
         assert chord(curve, *ends).line.length.value >= np.linalg.norm(curve[le] - curve[0]) - 1e-9
         measured += 1
-
-
-def random_airfoil(rng):
-    """An airfoil whose discs envelop a simple curve, or None."""
-    span = 10.0 ** rng.uniform(1.0, 2.0)
-    te = span * rng.uniform(0.003, 0.02)
-    le = te * rng.uniform(1.0, 3.0)
-    airfoil = DiscAirfoil(
-        span_mm=span,
-        camber_mm=span * rng.uniform(0.0, 0.25),
-        le_mm=le,
-        te_mm=te,
-        largest_mm=max(le * 1.1, span * rng.uniform(0.02, 0.09)),
-    )
-    t = np.linspace(0.0, 1.0, 501)
-    _, radius, slope = airfoil.discs(t)
-    speed = np.hypot(span, 4.0 * airfoil.camber_mm * (1.0 - 2.0 * t))
-    bend = 8.0 * airfoil.camber_mm * span / speed**3
-    simple = np.abs(slope / speed).max() < 0.9 and (radius * bend).max() < 0.9
-    return airfoil if simple else None
