@@ -1,6 +1,7 @@
 """The broken surface of one damage: which scan points lie on it, its local shape, which way it faces."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -73,6 +74,12 @@ class Skin:
         points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
         within = ((points >= low_mm) & (points <= high_mm)).all(axis=1)
         return points[within], self.normals[own[within]]
+
+
+@lru_cache(maxsize=2)
+def skin_of(mesh: Mesh) -> Skin:
+    """The skin of a mesh, made once for all steps that ask it."""
+    return Skin(mesh)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from geometry.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
 from geometry.nominal import ZONE_ORDER, Nominal
-from geometry.regions import Field, Region, RegionSettings, find_regions, on_twin, stand_off
+from geometry.regions import Field, Region, RegionSettings, find_regions, stand_off
 from geometry.register import Alignment
 from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone
@@ -70,7 +70,7 @@ def find_damages(
     told against the twin, not against the nominal.
     """
     found = stand_off(cloud, alignment, nominal, twin, settings.regions)
-    regions = find_regions(found, nominal, twin, settings.regions)
+    regions = find_regions(found, nominal, settings.regions)
     bent, single = _bent_pairs(regions, found, settings)
     damages = [_described(region, found, nominal, twin, settings) for region in single]
     damages += [_bent(a, b, found, nominal, settings) for a, b in bent]
@@ -144,7 +144,7 @@ def _mirror(missing: Region, excess: Region, found: Field, settings: DamageSetti
 def _described(
     region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings
 ) -> Damage:
-    body_mm = np.concatenate([found.scan_mm[region.points], on_twin(nominal, twin)[region.lost]])
+    body_mm = np.concatenate([found.scan_mm[region.points], found.skin_mm[region.lost]])
     zone = _zone(region, found, nominal, settings.touching)
     lowest = lowest_mm(region, found, twin)
     loss = _loss(region, found, nominal, twin, zone, lowest)
@@ -169,15 +169,15 @@ def _loss(
     if region.missing and zone in (Zone.LEADING_EDGE, Zone.TRAILING_EDGE):
         return edge_loss(region, found, nominal, twin, zone)
     if region.missing and zone is Zone.TIP:
-        return EdgeLoss(depth_mm=_tip_depth(lowest, nominal, twin), remaining_chord_mm=NOT_AN_EDGE)
+        return EdgeLoss(depth_mm=_tip_depth(lowest, found, nominal), remaining_chord_mm=NOT_AN_EDGE)
     return EdgeLoss(depth_mm=normal_depth(region, found), remaining_chord_mm=NOT_AN_EDGE)
 
 
-def _tip_depth(lowest: Measured, nominal: Nominal, twin: Twin) -> Measured:
+def _tip_depth(lowest: Measured, found: Field, nominal: Nominal) -> Measured:
     tip_face = nominal.samples.tip_face
     if not tip_face.any():
         return NotMeasured(reason="the span ends short of the tip")
-    return span_depth(float(on_twin(nominal, twin)[tip_face, 2].mean()), lowest)
+    return span_depth(float(found.skin_mm[tip_face, 2].mean()), lowest)
 
 
 def _above_root(lowest: Measured, nominal: Nominal) -> Measured:

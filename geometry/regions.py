@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from geometry.broken import Skin
+from geometry.broken import skin_of
 from geometry.errors import BadInput
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean
 from geometry.nominal import Nominal
@@ -55,6 +55,7 @@ class Field:
     smooth_mm: Floats  # (n,) mean distance over the neighbourhood
     sigma_mm: Floats  # (n,) of that mean
     on_airfoil: Bools  # (n,) nearest to required surface
+    skin_mm: Floats  # (s, 3) the samples of the required surface on the twin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,22 +86,23 @@ def stand_off(
         smooth_mm=neighbourhood_mean(distance_mm, neighbours[:, 1:]),
         sigma_mm=np.sqrt(np.maximum(mean_sigma_mm, settings.floor_mm) ** 2 + twin_sigma_mm**2),
         on_airfoil=nominal.airfoil_face[twin.nominal_face[face]],
+        skin_mm=_on_twin(nominal, twin),
     )
 
 
 def _twin_distances(scan_mm: Floats, twin: Twin) -> tuple[Floats, Ints]:
-    distance_mm, _, face = Skin(twin.mesh).closest(scan_mm)
+    distance_mm, _, face = skin_of(twin.mesh).closest(scan_mm)
     return distance_mm, face
 
 
-def find_regions(field: Field, nominal: Nominal, twin: Twin, settings: RegionSettings) -> list[Region]:
+def find_regions(field: Field, nominal: Nominal, settings: RegionSettings) -> list[Region]:
     """The regions of missing and of excess metal on the airfoil, each with the skin that it has lost."""
     groups = [
         (points, missing)
         for missing, sign in ((True, -1.0), (False, 1.0))
         for points in _connected(sign * field.smooth_mm, sign * field.height_mm, field, settings)
     ]
-    lost = _lost_skin(field, groups, nominal, twin)
+    lost = _lost_skin(field, groups, nominal)
     absent, excess = [i for i, g in enumerate(groups) if g[1]], [i for i, g in enumerate(groups) if not g[1]]
     merged = _merged([(groups[i][0], lost[i]) for i in absent], field, nominal, settings.join_mm)
     regions = [Region(points=points, lost=skin, missing=True) for points, skin in merged]
@@ -138,22 +140,23 @@ def _labels(chosen: Ints, neighbours: Ints) -> Ints:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal, twin: Twin) -> list[Ints]:
+def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal) -> list[Ints]:
     """For each group, the samples of the required surface that no sound point covers, and whose nearest
     scan point is in it or whose patch of uncovered skin borders on it."""
-    skin_mm = on_twin(nominal, twin)
     owner = np.full(len(field.scan_mm), -1, np.int64)
     for index, (points, _) in enumerate(groups):
         owner[points] = index
     sound = np.flatnonzero(owner < 0)
     reach_mm = max(SKIN_SPACINGS * field.spacing_mm, nominal.settings.sample_mm)
-    sound_mm = np.asarray(cKDTree(field.scan_mm[sound]).query(skin_mm, distance_upper_bound=reach_mm)[0])
+    sound_mm = np.asarray(
+        cKDTree(field.scan_mm[sound]).query(field.skin_mm, distance_upper_bound=reach_mm)[0]
+    )
     bare = np.flatnonzero(~np.isfinite(sound_mm))
     if not (len(bare) and groups):
         return [NONE for _ in groups]
-    patch = _patches(skin_mm[bare], 2.5 * nominal.settings.sample_mm)
+    patch = _patches(field.skin_mm[bare], 2.5 * nominal.settings.sample_mm)
     damaged = np.flatnonzero(owner >= 0)
-    distance_mm, nearest = cKDTree(field.scan_mm[damaged]).query(skin_mm[bare])
+    distance_mm, nearest = cKDTree(field.scan_mm[damaged]).query(field.skin_mm[bare])
     nearest_owner = owner[damaged[nearest]]
     lost: list[list[Ints]] = [[] for _ in groups]
     for label in np.unique(patch):
@@ -163,7 +166,8 @@ def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal, 
                 lost[group].append(bare[members & (nearest_owner == group)])
     loose = np.flatnonzero((sound_mm > field.spacing_mm) & np.isfinite(sound_mm))
     return [
-        _to_the_border(np.concatenate(parts), loose, skin_mm, nominal) if parts else NONE for parts in lost
+        _to_the_border(np.concatenate(parts), loose, field.skin_mm, nominal) if parts else NONE
+        for parts in lost
     ]
 
 
@@ -173,7 +177,7 @@ def _to_the_border(lost: Ints, loose: Ints, skin_mm: Floats, nominal: Nominal) -
     return np.concatenate([lost, loose[apart_mm <= 1.5 * nominal.settings.sample_mm]])
 
 
-def on_twin(nominal: Nominal, twin: Twin) -> Floats:
+def _on_twin(nominal: Nominal, twin: Twin) -> Floats:
     """The samples of the required surface (s, 3) moved onto the twin."""
     undeformed = cKDTree(twin.mesh.vertices_mm - twin.displacement_mm)
     near = np.asarray(undeformed.query(nominal.samples.points_mm)[1])

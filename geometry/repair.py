@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from geometry.broken import BrokenSurface, Scan, Skin, find_broken_surface, frames_along
+from geometry.broken import BrokenSurface, Scan, Skin, find_broken_surface, frames_along, skin_of
 from geometry.columns import volume_by_columns
 from geometry.cut_body import cut_body
 from geometry.damage import Damage, DamageKind
@@ -24,6 +24,7 @@ from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh
 
 BORDER_POINTS = 24  # sound points that tell how the skin meets the patch
 SAME_FACE = 0.9  # least cosine between places on one face of the part
+NEAR_MM = 2.0  # about a patch, where its vertices of the twin are sought
 NOT_MEASURED = NotMeasured(reason="was not measured")
 
 
@@ -99,7 +100,7 @@ def find_repairs(
     patches: list[Patch] = []
     failures: dict[int, str] = {}
     if missing:
-        skin, solid = Skin(twin.mesh), _solid(twin.mesh).as_original()
+        skin, solid = skin_of(twin.mesh), _solid(twin.mesh).as_original()
         scan = _scan(twin, cloud, alignment, damages)
     for i in missing:
         try:
@@ -297,7 +298,12 @@ def _border(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> tuple[Measured, 
 def _on_lost_skin(mesh: Mesh, outer: Bools, twin: Twin) -> tuple[Floats, Floats]:
     """Standard uncertainty of the twin (n,) at the outer faces, and the areas (n,) of these."""
     middle_mm, area_mm2 = _faces(mesh, outer)
-    return twin.sigma_mm[cKDTree(twin.mesh.vertices_mm).query(middle_mm)[1]], area_mm2
+    low_mm, high_mm = mesh.vertices_mm.min(axis=0) - NEAR_MM, mesh.vertices_mm.max(axis=0) + NEAR_MM
+    vertices_mm = twin.mesh.vertices_mm
+    near = np.flatnonzero(((vertices_mm >= low_mm) & (vertices_mm <= high_mm)).all(axis=1))
+    if not len(near):
+        near = np.arange(len(vertices_mm))
+    return twin.sigma_mm[near[cKDTree(vertices_mm[near]).query(middle_mm)[1]]], area_mm2
 
 
 def _lost_area(mesh: Mesh, outer: Bools, area_mm2: Floats, broken: BrokenSurface) -> Measurand:
@@ -325,7 +331,8 @@ def _volume_sigma(
     """
     middle_mm, area_mm2 = _faces(mesh, outer)
     from_noise = broken.sigma_mm * broken.area_mm2 / np.sqrt(len(broken.raw_mm))
-    to_break_mm, _ = cKDTree(_faces(mesh, ~outer)[0]).query(middle_mm)
+    broken_mm = _faces(mesh, ~outer)[0]
+    to_break_mm, _ = cKDTree(broken_mm).query(middle_mm, distance_upper_bound=broken.film_mm)
     from_film = broken.film_mm * float(area_mm2[to_break_mm < broken.film_mm].sum()) / np.sqrt(12.0)
     from_shape = np.hypot(difference_mm3 / np.sqrt(12.0), dropped_mm3 / np.sqrt(3.0))
     return float(np.linalg.norm([from_twin_mm3, from_noise, from_film, from_shape]))

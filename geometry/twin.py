@@ -83,7 +83,7 @@ def fit_twin(
     ground = _prepare(nominal, min(settings.nodes, max(len(cloud) // 4, 100)), settings)
     field, rounds, converged = _fit_smooth(scan_mm, mask, ground, settings, rng)
     found = _compare(scan_mm, field, ground, nominal.closest(scan_mm))
-    sound = _screen(found, found.usable, ground, settings.damage_mm)
+    sound = _screen(found, found.usable, ground, settings.damage_mm, 1)
     offset, noise_mm = _fit_ripple(found, sound, point_sigma_mm, field, ground, settings, rng)
     surface = _surface(field, offset, settings, rng)
     displacement_mm, sigma_mm, supported = _vertices(ground.refined, field, offset, surface, rng)
@@ -237,18 +237,20 @@ def _medians(owner: Ints, values: Floats, size: int) -> tuple[Floats, Bools]:
     return medians, some
 
 
-def _screen(found: _Found, chosen: Bools, ground: _Ground, damage_mm: float) -> Bools:
+def _screen(found: _Found, chosen: Bools, ground: _Ground, damage_mm: float, rings: int) -> Bools:
     """Which of the chosen points (n,) lie on sound surface: their node does not stand out, nor they of it.
 
     A node stands out where its median is deeper than `damage_mm` and far from the common run of nodes, or
-    joins one that does and is half as deep; so do the nodes around, for a hollow runs out flat.
+    joins one that does and is half as deep; so do `rings` of nodes around, for a hollow runs out flat.
     """
     median_mm, some = _medians(found.owner[chosen], found.along_mm[chosen], len(ground.nodes.points_mm))
     if not some.any():
         raise CannotFitTwin("no sound points on the airfoil")
     depth_mm = np.abs(median_mm)
     high_mm = max(damage_mm, 5.0 * _spread(median_mm[some]))
-    out = dilate(grow(depth_mm > high_mm, depth_mm > 0.5 * high_mm, ground.graph), ground.graph)
+    out = grow(depth_mm > high_mm, depth_mm > 0.5 * high_mm, ground.graph)
+    for _ in range(rings):
+        out = dilate(out, ground.graph)
     apart_mm = np.abs(found.along_mm - median_mm[found.owner])
     single_mm = max(damage_mm, 5.0 * _spread(apart_mm[chosen]))
     return np.asarray(chosen & ~out[found.owner] & (apart_mm <= single_mm))
@@ -278,7 +280,7 @@ def _fit_smooth(
             return field, rounds, True
         before_mm = after_mm
         found = _compare(points_mm, field, ground, found.near)
-        sound = _screen(found, found.usable, ground, loose_mm)
+        sound = _screen(found, found.usable, ground, loose_mm, 0)
     if field is None:
         raise CannotFitTwin("no round was allowed")
     return field, settings.rounds, False

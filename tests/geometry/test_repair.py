@@ -15,11 +15,12 @@ from geometry.repair import (
     RepairSettings,
     RepairVolume,
     find_repairs,
+    in_frame,
     to_scan_frame,
     with_allowance,
 )
 from geometry.solid import solid_normals
-from geometry.transforms import apply, inverse, rigid
+from geometry.transforms import apply, exp, inverse, rigid
 from geometry.types import Cloud, Measurand, Mesh, Zone
 from tests.geometry import repair_blades as blades
 
@@ -307,8 +308,62 @@ def test_an_allowance_grows_the_outer_skin_only(name: str) -> None:
     assert with_allowance(patch, 0.0).vertices_mm == pytest.approx(patch.mesh.vertices_mm)
 
 
+@pytest.mark.parametrize("name", ["tip corner", "pit", "edge nick"])
+def test_a_patch_is_written_with_its_allowance_and_counted_without(name: str) -> None:
+    specimen = scanned(name, 0.015)
+    settings = RepairSettings(allowance_mm=0.25)
+    (patch,) = find_repairs(
+        specimen.twin, specimen.cloud, specimen.alignment, specimen.damages, settings
+    ).patches
+    assert patch.volume_mm3.value == repaired(name, 0.015).volume_mm3.value
+    written = blades.solid_of(patch.written)
+    assert patch.written_mm3.value == pytest.approx(written.volume(), rel=1e-6)
+    assert written.volume() > patch.volume_mm3.value
+    edges = edges_of(patch.written)
+    assert all(count == 1 and edges.get((b, a)) == 1 for (a, b), count in edges.items())
+    outer = np.unique(patch.mesh.faces[patch.outer])
+    height_mm = repair_module.Skin(specimen.twin.mesh).closest(patch.written.vertices_mm[outer])[0]
+    assert height_mm.min() > 0.24  # nowhere less than the allowance above the twin
+
+
+@pytest.mark.parametrize("name", ["tip corner", "pit"])
+def test_the_area_of_the_lost_skin_is_that_of_the_cut(name: str) -> None:
+    _, cutter = CUTTERS[name]
+    whole = blades.solid_of(blades.blade_mesh()).as_original()
+    lost = (whole ^ cutter()).to_mesh64()
+    skin = np.asarray(lost.run_original_id) == whole.original_id()
+    runs = np.asarray(lost.run_index) // 3
+    faces = np.concatenate([np.arange(runs[i], runs[i + 1]) for i in np.flatnonzero(skin)])
+    corner = np.asarray(lost.vert_properties)[:, :3][np.asarray(lost.tri_verts)[faces]]
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = repaired(name, 0.015).area_mm2
+    assert isinstance(area, Measurand)
+    assert abs(area.value - 0.5 * np.linalg.norm(cross, axis=1).sum()) < 2.0 * area.sigma
+
+
+def test_a_patch_in_another_frame_is_the_same_solid() -> None:
+    patch = repaired("pit", 0.0)
+    T = exp(np.array([0.3, -0.2, 1.1, 10.0, -4.0, 33.0]), np.zeros(3))
+    moved = in_frame(patch.mesh, T)
+    assert blades.solid_of(moved).volume() == pytest.approx(patch.volume_mm3.value, rel=1e-6)
+    back = in_frame(moved, inverse(T))
+    np.testing.assert_allclose(back.vertices_mm, patch.mesh.vertices_mm, atol=1e-9)
+    with pytest.raises(BadInput, match="rigid"):
+        in_frame(patch.mesh, 2.0 * np.eye(4))
+
+
+def test_where_the_twin_is_a_guess_there_is_no_patch() -> None:
+    specimen = scanned("pit", 0.0)
+    unsure = replace(specimen.twin, sigma_mm=np.full_like(specimen.twin.sigma_mm, 0.6))
+    found = repairs_of(replace(specimen, twin=unsure))
+    assert not found.patches
+    assert found.failures
+
+
 def test_nonsense_is_refused() -> None:
     with pytest.raises(BadInput, match="allowance"):
         with_allowance(repaired("pit", 0.0), float("nan"))
     with pytest.raises(BadInput, match="settings"):
         RepairSettings(max_gap_mm=0.0)
+    with pytest.raises(BadInput, match="settings"):
+        RepairSettings(allowance_mm=-0.1)

@@ -317,6 +317,25 @@ def dented(shape: Shape, theta: float, z: float, depth_mm: float, width_mm: floa
     return Shape(offset, shape.warp)
 
 
+def hollowed(shape: Shape, centres: Array, depth_mm: float, width_mm: float) -> Shape:
+    """`shape` with smooth round hollows about points (n, 3) of its surface, apart from each other."""
+
+    def offset(t: Array, h: Array) -> Array:
+        points = shape.surface(t, h)
+        return np.asarray(shape.offset(t, h) - hollow_depth(points, centres, depth_mm, width_mm))
+
+    return Shape(offset, shape.warp)
+
+
+def hollow_depth(points: Array, centres: Array, depth_mm: float, width_mm: float) -> Array:
+    """Depth (...) at points (..., 3) of hollows about centres (n, 3), which do not overlap."""
+    total = np.zeros(points.shape[:-1])
+    for centre in centres:
+        r = np.linalg.norm(points - centre, axis=-1)
+        total += depth_mm * np.cos(0.5 * pi * np.clip(2.0 * r / width_mm, 0.0, 1.0)) ** 2
+    return total
+
+
 @dataclass(frozen=True)
 class Scan:
     """Points of a damaged blade; `label` 0 on sound metal, i + 1 on the broken surface of cut i."""
