@@ -14,7 +14,8 @@ from geometry.transforms import apply, inverse, rigid
 from geometry.types import Floats
 
 DESCENT_STEPS = 15
-FALLBACK_POINTS = 300
+FALLBACK_POINTS = 200
+SHELL_REACH_MM = 2.0  # a point further off its nearest shell point is off the surface
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,14 +50,16 @@ def find_pose(points_mm: Floats, nominal: Nominal, settings: CoarseSettings) -> 
     """
     few_mm = points_mm[every(len(points_mm), settings.points)]
     shell = cKDTree(nominal.shell_mm)
-    ranked = _rank(
-        _descend(few_mm, _axis_starts(points_mm, nominal), nominal, shell), few_mm, nominal, settings
-    )
+    starts = _descend(few_mm, _axis_starts(points_mm, nominal), nominal, shell)
+    ranked = _rank(starts, few_mm, nominal, shell, settings)
     if not _clear(ranked, settings):
         sparse_mm = few_mm[every(len(few_mm), FALLBACK_POINTS)]
-        starts = _descend(sparse_mm, _many_starts(points_mm, nominal), nominal, shell)
-        more = _descend(few_mm, _promising(starts, sparse_mm, shell), nominal, shell)
-        ranked = _rank(np.concatenate([[c.T_nominal_scan for c in ranked], more]), few_mm, nominal, settings)
+        more = _many_starts(points_mm, nominal)
+        for most in (64, 16):
+            more = _promising(_descend(sparse_mm, more, nominal, shell, steps=6), sparse_mm, shell, most)
+        more = _descend(few_mm, more, nominal, shell)
+        poses = np.concatenate([[pose.T_nominal_scan for pose in ranked], more])
+        ranked = _rank(poses, few_mm, nominal, shell, settings)
     best, *others = ranked
     ratio = others[0].score_mm / best.score_mm if others else np.inf
     return Coarse(T_nominal_scan=best.T_nominal_scan, score_mm=best.score_mm, runner_up_ratio=float(ratio))
@@ -106,11 +109,13 @@ def _many_starts(points_mm: Floats, nominal: Nominal) -> Floats:
     return np.stack(starts)
 
 
-def _descend(points_mm: Floats, starts: Floats, nominal: Nominal, shell: cKDTree) -> Floats:
+def _descend(
+    points_mm: Floats, starts: Floats, nominal: Nominal, shell: cKDTree, steps: int = DESCENT_STEPS
+) -> Floats:
     """The poses (s, 4, 4) after a few damped, robust point-to-plane steps on the shell, all at once."""
     poses = starts.copy()
     scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
-    for _ in range(DESCENT_STEPS):
+    for _ in range(steps):
         moved_mm = np.einsum("sij,nj->sni", poses[:, :3, :3], points_mm) + poses[:, None, :3, 3]
         distance_mm, nearest = shell.query(moved_mm)
         normals = nominal.shell_normals[nearest]
@@ -135,27 +140,41 @@ def _turned(poses: Floats, twists: Floats, pivot_mm: Floats) -> Floats:
     return moved
 
 
-def _promising(poses: Floats, points_mm: Floats, shell: cKDTree, most: int = 16) -> Floats:
+def _promising(poses: Floats, points_mm: Floats, shell: cKDTree, most: int) -> Floats:
     """The poses with the least mean truncated distance to the shell."""
     moved_mm = np.einsum("sij,nj->sni", poses[:, :3, :3], points_mm) + poses[:, None, :3, 3]
     distance_mm, _ = shell.query(moved_mm, distance_upper_bound=2.0)
     return np.asarray(poses[np.argsort(np.minimum(distance_mm, 2.0).mean(axis=1), kind="stable")[:most]])
 
 
-def _rank(poses: Floats, points_mm: Floats, nominal: Nominal, settings: CoarseSettings) -> list[_Pose]:
+def _rank(
+    poses: Floats, points_mm: Floats, nominal: Nominal, shell: cKDTree, settings: CoarseSettings
+) -> list[_Pose]:
     """The poses that differ, best first; the best three settled by the robust fit on the exact nominal."""
-    scored = [_scored(T, points_mm, nominal, settings) for T in poses]
+    scored = [_roughly_scored(T, points_mm, nominal, shell, settings) for T in poses]
     different = _different(sorted(scored, key=lambda pose: pose.score_mm), nominal, settings)
     settled = [fit_robust(points_mm, pose.T_nominal_scan, nominal, steps=12) for pose in different[:3]]
-    again = [_scored(fit.T_nominal_scan, points_mm, nominal, settings) for fit in settled]
+    again = [_scored(fit.T_nominal_scan, fit.found.distance_mm, settings) for fit in settled]
     best = [min(a, b, key=lambda pose: pose.score_mm) for a, b in zip(again, different[:3], strict=True)]
     ordered = sorted(best + different[3:], key=lambda pose: pose.score_mm)
     return _different(ordered, nominal, settings)
 
 
-def _scored(T_nominal_scan: Floats, points_mm: Floats, nominal: Nominal, settings: CoarseSettings) -> _Pose:
-    distance_mm = np.abs(nominal.closest(apply(T_nominal_scan, points_mm)).distance_mm)
-    score_mm = float(np.minimum(distance_mm, settings.cap_mm).mean())
+def _roughly_scored(
+    T_nominal_scan: Floats, points_mm: Floats, nominal: Nominal, shell: cKDTree, settings: CoarseSettings
+) -> _Pose:
+    """The pose scored against the tangent planes of the shell, which hold as far as its points are apart."""
+    moved_mm = apply(T_nominal_scan, points_mm)
+    apart_mm, nearest = shell.query(moved_mm, distance_upper_bound=SHELL_REACH_MM)
+    near = np.isfinite(apart_mm)
+    offset_mm = moved_mm[near] - nominal.shell_mm[nearest[near]]
+    distance_mm = np.full(len(points_mm), settings.cap_mm)
+    distance_mm[near] = np.einsum("nj,nj->n", offset_mm, nominal.shell_normals[nearest[near]])
+    return _scored(T_nominal_scan, distance_mm, settings)
+
+
+def _scored(T_nominal_scan: Floats, distance_mm: Floats, settings: CoarseSettings) -> _Pose:
+    score_mm = float(np.minimum(np.abs(distance_mm), settings.cap_mm).mean())
     return _Pose(T_nominal_scan=T_nominal_scan, score_mm=max(score_mm, 1e-9))
 
 

@@ -13,6 +13,7 @@ TUKEY = 4.685  # 95 % efficient on normal residuals
 ANNEAL = (60.0, 40.0, 25.0, 15.0, 10.0, 7.0, 5.0, TUKEY)  # widths of the first steps, in robust sigmas
 WEAK = 1e-5  # eigenvalue a point, of a unit displacement: the surface does not feel the motion
 LONGEST_STEP_RAD = 0.3
+LONGEST_KEPT_STEP_MM = 0.5  # a fit to points that were chosen near the surface has no reason to go farther
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,12 +61,12 @@ def solve_step(nominal: Nominal, moved_mm: Floats, found: Closest, weights: Floa
     scaled = -vectors @ np.where(strong, along / np.where(strong, values, 1.0), 0.0)
     twist = scaled * scale
     twist *= min(1.0, LONGEST_STEP_RAD / (float(np.linalg.norm(twist[:3])) + 1e-12))
-    weak = tuple(tuple(float(x) for x in _unit_twist(vectors[:, i] * scale)) for i in np.flatnonzero(~strong))
+    weak = tuple(unit_twist(vectors[:, i] * scale) for i in np.flatnonzero(~strong))
     return Step(twist=twist, weak=weak, size_mm=float(np.linalg.norm(scaled)))
 
 
-def _unit_twist(twist: Floats) -> Floats:
-    return np.asarray(twist / np.linalg.norm(twist))
+def unit_twist(twist: Floats) -> tuple[float, ...]:
+    return tuple(float(x) for x in twist / np.linalg.norm(twist))
 
 
 def fit_robust(
@@ -104,7 +105,8 @@ def fit_kept(
         moved_mm = apply(T, points_mm)
         weights = (kept & felt(nominal, found)).astype(np.float64)
         step = solve_step(nominal, moved_mm, found, weights)
-        T, weak = exp(step.twist, nominal.pivot_mm) @ T, step.weak
+        twist = step.twist * min(1.0, LONGEST_KEPT_STEP_MM / (step.size_mm + 1e-12))
+        T, weak = exp(twist, nominal.pivot_mm) @ T, step.weak
         found = nominal.closest_from(apply(T, points_mm), found.face)
         taken, size_mm = taken + 1, step.size_mm
     return Fit(T_nominal_scan=T, found=found, weak=weak, iterations=taken, converged=size_mm < close_mm)

@@ -6,12 +6,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.errors import BadInput
+from geometry.kernels.form import blend, local_fits
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean
+from geometry.kernels.neighbours import cell_index, counting_sort
 from geometry.types import Bools, Floats, Ints
 
 TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
 BLENDED = 6  # nodes around a point whose local fits are blended there
 IRLS_STEPS = 4
+RIDGE = 1e-3  # flat surfaces do not tell all motions
 REACHES = 6
 
 
@@ -71,13 +74,14 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
             return np.zeros(len(points_mm))
         nodes = chosen[_every_nth(len(chosen), settings.form_nodes)]
         _, members = _nearest(place[chosen], place[nodes], settings.form_window)
-        around = chosen[members]
-        fits = _local_fits(points_mm[nodes], points_mm[around], normals[around], distance_mm[around])
-        form_mm = _blend(place[few], place[nodes], normals[few], fits)
+        fits = local_fits(
+            points_mm[nodes], chosen[members], points_mm, normals, distance_mm, IRLS_STEPS, RIDGE
+        )
+        form_mm = _blend(points_mm[few], normals[few], points_mm[nodes], normals[nodes], fits)
         before, near = near, near | (np.abs(distance_mm[few] - form_mm) <= limit_mm)
         if np.array_equal(before, near):
             break
-    return _blend(place, place[nodes], normals, fits)
+    return _blend(points_mm, normals, points_mm[nodes], normals[nodes], fits)
 
 
 def _clear(place: Floats, near: Bools, rim_mm: float) -> Bools:
@@ -97,38 +101,20 @@ def _nearest(targets: Floats, places: Floats, k: int) -> tuple[Floats, Ints]:
     return np.asarray(apart, np.float64), np.asarray(nearest, np.int64)
 
 
-def _smooth_motions(offset_mm: Floats, normals: Floats) -> Floats:
-    """What shifts, turns, thickening and its slope move points (m, k) along their normals: (m, k, 10)."""
-    ones = np.ones((*offset_mm.shape[:2], 1))
-    return np.concatenate([normals, np.cross(offset_mm, normals), ones, offset_mm], axis=2)
-
-
-def _local_fits(nodes_mm: Floats, points_mm: Floats, normals: Floats, distance_mm: Floats) -> Floats:
-    """The smooth motion (m, 10) round each node: weighted least squares over its k members, Tukey's weights.
-
-    A shift explains both sides of an edge at once, where the distance itself jumps from one to the other.
-    """
-    offset_mm = points_mm - nodes_mm[:, None]
-    apart = np.linalg.norm(offset_mm, axis=2)
-    closeness = np.exp(-4.5 * (apart / apart.max(axis=1, keepdims=True)) ** 2)  # the last at three sigmas
-    design = _smooth_motions(offset_mm, normals)
-    ridge = 1e-3 * points_mm.shape[1] * np.eye(design.shape[2])  # flat surfaces do not tell all of them
-    weights = closeness
-    for _ in range(IRLS_STEPS):
-        weighted = np.swapaxes(design * weights[:, :, None], 1, 2)
-        motions = np.linalg.solve(weighted @ design + ridge, weighted @ distance_mm[:, :, None])
-        residual = distance_mm - (design @ motions)[:, :, 0]
-        scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=1, keepdims=True), 1e-6)
-        weights = closeness * np.maximum(1.0 - (residual / (4.685 * scale)) ** 2, 0.0) ** 2
-    return np.asarray(motions[:, :, 0])
-
-
-def _blend(place: Floats, nodes: Floats, normals: Floats, fits: Floats) -> Floats:
+def _blend(
+    points_mm: Floats, normals: Floats, nodes_mm: Floats, node_normals: Floats, fits: Floats
+) -> Floats:
     """The local fits at each point (n,), weighted by closeness over the nearest nodes."""
-    apart, nearest = _nearest(nodes, place, BLENDED)
-    weights = np.maximum(1.0 - (apart / (1.05 * apart[:, -1:] + 1e-9)) ** 2, 0.0) ** 2
-    values = np.zeros(len(place))
-    for j in range(BLENDED):
-        motions = _smooth_motions((place[:, :3] - nodes[nearest[:, j], :3])[:, None], normals[:, None])[:, 0]
-        values += weights[:, j] * np.einsum("ni,ni->n", motions, fits[nearest[:, j]])
-    return np.asarray(values / weights.sum(axis=1))
+    low_mm, cell_mm = nodes_mm.min(axis=0), _node_pitch(nodes_mm)
+    cells = ((nodes_mm.max(axis=0) - low_mm) / cell_mm).astype(np.int64) + 1
+    starts, order = counting_sort(cell_index(nodes_mm, low_mm, cell_mm, cells), int(cells.prod()))
+    grid = (order, starts, low_mm, cell_mm, cells)
+    return np.asarray(
+        blend(points_mm, normals, nodes_mm, node_normals, fits, BLENDED, TURN_MM, *grid), dtype=np.float64
+    )
+
+
+def _node_pitch(nodes_mm: Floats) -> float:
+    """How far most nodes have enough others to blend, and no less than fills a modest grid."""
+    apart_mm, _ = _nearest(nodes_mm, nodes_mm, BLENDED)
+    return max(float(np.median(apart_mm[:, -1])), float(np.ptp(nodes_mm, axis=0).max()) / 100.0, 1e-9)

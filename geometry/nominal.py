@@ -57,6 +57,15 @@ class Closest:
     distance_mm: Floats  # (n,) signed
     face: Ints  # (n,)
 
+    def of(self, chosen: Bools) -> "Closest":
+        """Those of the chosen points (n,)."""
+        return Closest(
+            points_mm=self.points_mm[chosen],
+            normals=self.normals[chosen],
+            distance_mm=self.distance_mm[chosen],
+            face=self.face[chosen],
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NominalSection:

@@ -1,17 +1,19 @@
 """Cloud onto nominal: coarse, robust, then plain least squares on what is not damaged."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from geometry.coarse import Coarse, CoarseSettings, find_pose
 from geometry.errors import BadInput, CannotRegister
-from geometry.fit import Fit, every, felt, fit_kept, fit_robust, information
+from geometry.fit import Fit, every, felt, fit_kept, fit_robust, information, unit_twist
 from geometry.mask import MaskSettings, damaged, form_of, robust_sigma
 from geometry.nominal import Closest, Nominal
+from geometry.slide import LEAST, slides_mm
 from geometry.surface import k_nearest
-from geometry.transforms import apply
+from geometry.transforms import apply, exp
 from geometry.types import Bools, Cloud, Floats, Ints
+from geometry.uncertainty import Certainty, certainty, form_covariance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -20,14 +22,16 @@ class Alignment:
 
     A pose error is a twist (rx, ry, rz in rad, tx, ty, tz in mm) that turns about `pivot_mm` and
     then shifts, applied on the nominal side: `exp(twist, pivot_mm) @ T_nominal_scan`.
-    `information` (6, 6) is the inverse covariance of that twist from point noise alone.
+    `information` (6, 6) is the inverse covariance of that twist from point noise alone;
+    `form_covariance` (6, 6) is what the form of the part adds to that covariance: deviations that many
+    neighbouring points share. Both together are the uncertainty of the pose.
     """
 
     method: str
     T_nominal_scan: Floats  # (4, 4)
     pivot_mm: Floats  # (3,), nominal frame
     information: Floats  # (6, 6)
-    weak_directions: tuple[tuple[float, ...], ...]  # unit twists the surface leaves free
+    weak_directions: tuple[tuple[float, ...], ...]  # unit twists the surface leaves free, or nearly so
     rms_mm: float  # of the kept points, along the normal
     noise_mm: float  # robust standard deviation of the kept residuals
     inlier_fraction: float  # kept as undamaged
@@ -35,6 +39,7 @@ class Alignment:
     runner_up_ratio: float  # score of the second-best coarse pose over the best; 1 = ambiguous
     iterations: int
     converged: bool
+    form_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,12 +51,14 @@ class RegisterSettings:
     fit_points: int = 250_000  # of the cloud, for mask and least squares: 0.0005 mm of noise at most
     rounds: int = 2  # of mask and least squares
     explained_mm: float = 0.3
+    loose_mm: float = 0.3  # standard uncertainty of the surface along a motion that makes it a free one
+    slide_mm: float = 0.05  # the same, beyond which other places along that motion are tried
 
     def __post_init__(self) -> None:
         if not (self.least_points >= 50 and self.robust_points >= 500 and self.rounds >= 1):
             raise BadInput(f"register: {self} asks for too few points or rounds")
-        if not self.explained_mm > 0.0:
-            raise BadInput(f"register: explained_mm = {self.explained_mm} is not a distance")
+        if not min(self.explained_mm, self.loose_mm, self.slide_mm) > 0.0:
+            raise BadInput(f"register: {self} has a distance that is none")
 
 
 def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = RegisterSettings()) -> Alignment:
@@ -59,8 +66,9 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
 
     Coarse by principal axes and many starts, then point-to-plane with Tukey's weights on the exact mesh,
     then rounds of damage mask and plain least squares on the rest. Neither step moves along a direction that
-    the surface does not feel (a constant section with linear twist is a screw); such are reported.
-    Raises `CannotRegister` for a cloud too small or without shape.
+    the surface does not feel (a constant section with linear twist is a screw). Where noise and form leave
+    one open, other places along it are tried for the ends that they would explain; what stays open is
+    reported. Raises `CannotRegister` for a cloud too small or without shape.
     """
     if len(cloud) < settings.least_points:
         raise CannotRegister(f"{len(cloud)} scan points are fewer than {settings.least_points}")
@@ -69,8 +77,20 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
     few_mm = cloud.points_mm[every(len(cloud), settings.robust_points)]
     robust = fit_robust(few_mm, coarse.T_nominal_scan, nominal)
     neighbours, _ = k_nearest(cloud.points_mm, min(settings.mask.neighbours + 1, len(cloud)))
-    fit, kept, turns = _fit_undamaged(cloud, robust, neighbours, nominal, settings)
-    return _alignment(cloud, nominal, fit, kept, coarse, robust.iterations + turns, settings)
+    settled = _settled(cloud, robust, neighbours, nominal, settings)
+    places = [settled, *_elsewhere(cloud, settled, neighbours, nominal, settings)]
+    return _alignment(cloud, nominal, places, coarse, robust.iterations, settings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Settled:
+    """A least-squares pose, the points it rests on, and how certain it is."""
+
+    fit: Fit
+    kept: Bools
+    information: Floats
+    form_covariance: Floats
+    certainty: Certainty
 
 
 def _thinned(cloud: Cloud, most: int) -> Cloud:
@@ -78,26 +98,49 @@ def _thinned(cloud: Cloud, most: int) -> Cloud:
     return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
 
 
-def _fit_undamaged(
+def _settled(
     cloud: Cloud, start: Fit, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
-) -> tuple[Fit, Bools, int]:
-    """Rounds of mask and least squares on the whole cloud: the fit, the kept points, the steps taken."""
-    found = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm))
-    fit = Fit(
-        T_nominal_scan=start.T_nominal_scan,
-        found=found,
-        weak=start.weak,
-        iterations=0,
-        converged=start.converged,
-    )
-    turns = 0
+) -> _Settled:
+    """Rounds of mask and least squares on the whole cloud."""
+    found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
+    fit = replace(start, found=found)
     for _ in range(settings.rounds):
         kept = ~_damage_of(cloud, fit.found, neighbours, nominal, settings) & felt(nominal, fit.found)
         if kept.sum() < settings.least_points:
             raise CannotRegister(f"{int(kept.sum())} scan points lie on the nominal")
         fit = fit_kept(cloud.points_mm, fit, kept, nominal)
         turns += fit.iterations
-    return fit, kept, turns
+    moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
+    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept])
+    form = form_covariance(nominal, moved_mm, found)
+    return _Settled(
+        fit=replace(fit, iterations=turns),
+        kept=kept,
+        information=known,
+        form_covariance=form,
+        certainty=certainty(nominal, known, form),
+    )
+
+
+def _elsewhere(
+    cloud: Cloud, settled: _Settled, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
+) -> list[_Settled]:
+    """Other poses along the least certain motion that explain more of the scan and are surer of it."""
+    sigma_mm, twist = float(settled.certainty.sigma_mm[-1]), settled.certainty.twists[:, -1]
+    if sigma_mm <= settings.slide_mm:
+        return []
+    T, found = settled.fit.T_nominal_scan, settled.fit.found
+    near_mm = max(4.0 * robust_sigma(found.distance_mm[settled.kept]), 0.05)
+    moved_mm = apply(T, cloud.points_mm)
+    off = (np.abs(found.distance_mm) > near_mm) & ~settled.kept
+    places = []
+    for move_mm in slides_mm(moved_mm[settled.kept], moved_mm[off], twist, 4.0 * sigma_mm, near_mm, nominal):
+        moved = replace(settled.fit, T_nominal_scan=exp(move_mm * twist, nominal.pivot_mm) @ T)
+        place = _settled(cloud, moved, neighbours, nominal, settings)
+        surer = place.certainty.sigma_mm[-1] < 0.5 * sigma_mm
+        if surer and place.kept.sum() >= settled.kept.sum() + LEAST:
+            places.append(place)
+    return sorted(places, key=lambda place: -int(place.kept.sum()))
 
 
 def _damage_of(
@@ -111,12 +154,13 @@ def _damage_of(
 def _alignment(
     cloud: Cloud,
     nominal: Nominal,
-    fit: Fit,
-    kept: Bools,
+    places: list[_Settled],
     coarse: Coarse,
     iterations: int,
     settings: RegisterSettings,
 ) -> Alignment:
+    settled = places[min(1, len(places) - 1)]
+    fit, kept = settled.fit, settled.kept
     moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
     residual_mm = fit.found.distance_mm[kept]
     on_part = moved_mm[:, 2] >= nominal.z_min_mm
@@ -125,16 +169,34 @@ def _alignment(
         method="airfoil",
         T_nominal_scan=fit.T_nominal_scan,
         pivot_mm=nominal.pivot_mm,
-        information=information(nominal, moved_mm[kept], fit.found.normals[kept], cloud.sigma_mm[kept]),
-        weak_directions=fit.weak,
+        information=settled.information,
+        form_covariance=settled.form_covariance,
+        weak_directions=_weak(places, settings),
         rms_mm=float(np.sqrt(np.mean(residual_mm**2))),
         noise_mm=robust_sigma(residual_mm),
         inlier_fraction=float(kept.mean()),
         explained_fraction=float(explained.mean()) if len(explained) else 0.0,
         runner_up_ratio=coarse.runner_up_ratio,
-        iterations=iterations,
+        iterations=iterations + fit.iterations,
         converged=fit.converged,
     )
+
+
+def _weak(places: list[_Settled], settings: RegisterSettings) -> tuple[tuple[float, ...], ...]:
+    """Unit twists that the chosen place leaves open, or that two places contest."""
+    chosen = places[min(1, len(places) - 1)]
+    open_ = [unit_twist(t) for t in chosen.certainty.twists.T[chosen.certainty.sigma_mm > settings.loose_mm]]
+    if len(places) > 2 and not _won(places):
+        open_ = open_ or [unit_twist(places[0].certainty.twists[:, -1])]
+    return tuple(open_) if len(open_) > len(chosen.fit.weak) else chosen.fit.weak
+
+
+def _won(places: list[_Settled]) -> bool:
+    """Whether the best other place explains twice as many more points as the next that is another one."""
+    first, best, *rest = places
+    gain = int(best.kept.sum() - first.kept.sum())
+    rivals = [r for r in rest if not np.allclose(r.fit.T_nominal_scan, best.fit.T_nominal_scan, atol=0.05)]
+    return all(gain >= 2 * int(r.kept.sum() - first.kept.sum()) for r in rivals)
 
 
 def mask_damage(

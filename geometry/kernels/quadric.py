@@ -48,7 +48,7 @@ def balanced_quadrics(
                 right[a] += row[a] * w
                 for b in range(a + 1):
                     design[a, b] += row[a] * row[b]
-        solved = found >= 5 and _solve(design, right)
+        solved = found >= 5 and cholesky_solve(design, right)
         if not solved:
             right[:] = np.nan
         gx, gy = right[1], right[2]
@@ -125,7 +125,7 @@ def _least_axis(xx, yy, zz, xy, yz, xz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve(a: Floats, b: Floats) -> bool:
+def cholesky_solve(a: Floats, b: Floats) -> bool:
     """Solve a x = b in place by Cholesky (lower half of `a` used); False if not positive definite."""
     n = len(b)
     for j in range(n):

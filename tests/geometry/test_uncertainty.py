@@ -1,0 +1,85 @@
+"""The stated uncertainty of a pose against the scatter of many."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from geometry.fit import Fit, fit_kept, information
+from geometry.nominal import NominalSettings, prepare_nominal
+from geometry.transforms import apply, log
+from geometry.uncertainty import certainty, form_covariance
+from tests.geometry import blades
+
+BLADE = blades.Blade()
+SIGMA_MM = 0.015
+
+
+@cache
+def nominal():
+    return prepare_nominal(blades.mesh(BLADE), NominalSettings(z_min_mm=0.0, z_max_mm=BLADE.height_mm))
+
+
+@cache
+def exact():
+    return nominal().closest(blades.scan(BLADE, 0.4, np.random.default_rng(1)).points_mm)
+
+
+def fitted(residual_mm):
+    """The twist that least squares gives points off the surface by `residual_mm`, and the stated parts."""
+    points_mm = exact().points_mm + residual_mm[:, None] * exact().normals
+    found = nominal().closest(points_mm)
+    start = Fit(T_nominal_scan=np.eye(4), found=found, weak=(), iterations=0, converged=False)
+    fit = fit_kept(points_mm, start, np.ones(len(points_mm), bool), nominal())
+    moved_mm = apply(fit.T_nominal_scan, points_mm)
+    known = information(nominal(), moved_mm, fit.found.normals, np.full(len(points_mm), SIGMA_MM))
+    return log(fit.T_nominal_scan, nominal().pivot_mm), known, form_covariance(nominal(), moved_mm, fit.found)
+
+
+def scaled_errors(residuals):
+    """Errors (runs, 6) along the motions of the stated covariance, in its sigmas."""
+    scaled = []
+    for residual_mm in residuals:
+        twist, known, form = fitted(residual_mm)
+        stated = certainty(nominal(), known, form)
+        scaled.append(np.linalg.solve(stated.twists, twist) / stated.sigma_mm)
+    return np.array(scaled)
+
+
+def test_noise_alone_is_stated_rightly_in_every_direction():
+    rng = np.random.default_rng(2)
+    errors = scaled_errors(rng.normal(scale=SIGMA_MM, size=len(exact().points_mm)) for _ in range(60))
+    spread = np.sqrt(np.mean(errors**2, axis=0))
+    assert ((spread > 0.75) & (spread < 1.25)).all()  # 200 draws: within 0.8 to 1.25 by the benchmark
+
+
+def test_noise_alone_has_next_to_no_form():
+    rng = np.random.default_rng(3)
+    _, known, form = fitted(rng.normal(scale=SIGMA_MM, size=len(exact().points_mm)))
+    assert np.trace(form) < 0.5 * np.trace(np.linalg.inv(known))
+
+
+def test_the_form_is_stated_within_a_factor_of_a_few():
+    """A smooth random form: what it does to the pose is far above the noise, and covered."""
+    rng = np.random.default_rng(4)
+    feet_mm, normals = exact().points_mm, exact().normals
+    residuals = []
+    for _ in range(25):
+        waves = rng.normal(scale=[0.08, 0.3, 0.08], size=(12, 3))
+        phases, sizes = rng.uniform(0, 2 * np.pi, 12), rng.normal(scale=0.008, size=12)
+        side = np.where(rng.random(12)[:, None] < 0.5, 1.0, np.sign(normals[:, 1] + 1e-12))
+        form = (sizes[:, None] * side * np.sin(waves @ feet_mm.T + phases[:, None])).sum(axis=0)
+        residuals.append(form + rng.normal(scale=SIGMA_MM, size=len(form)))
+    spread = np.sqrt(np.mean(scaled_errors(residuals) ** 2, axis=0))
+    assert ((spread > 0.15) & (spread < 2.5)).all()
+    twists = np.array([fitted(residual)[0] for residual in residuals[:8]])
+    noise_mm = np.sqrt(np.linalg.inv(fitted(residuals[0])[1])[3, 3])
+    assert np.sqrt(np.mean(twists[:, 3] ** 2)) > 3.0 * noise_mm
+
+
+def test_a_free_motion_is_huge_and_finite():
+    free = np.diag([1e6, 1e6, 0.0, 1e6, 1e6, 0.0])
+    stated = certainty(nominal(), free, np.zeros((6, 6)))
+    assert np.isfinite(stated.sigma_mm).all()
+    assert (stated.sigma_mm[-2:] > 1e3).all()
+    assert stated.sigma_mm[0] == pytest.approx(1e-3, rel=0.5)
