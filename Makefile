@@ -6,10 +6,10 @@ DEMO ?= auto
 DEMO_FLAGS := $(if $(filter headless,$(DEMO)),--headless,)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint check bench lock picture
+.PHONY: help setup demo test lint check bench bench-registration bench-sections bench-twin campaign lock picture
 
 help:      ## this list
-	@grep -E '^[a-z-]+: .*## ' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+: .*## ' Makefile | sed -E 's/:.*## /\t/' | expand -t 20
 
 setup: .venv/.ready  ## virtual environment with the locked packages and the bladecell command
 
@@ -36,6 +36,25 @@ check: test  ## the same as test
 
 bench: setup  ## accuracy and time of every stage, one table each
 	$(BIN)/python -m benchmarks
+
+bench-registration: setup  ## registration alone: accuracy, damage found, certainty, peers, random poses
+	$(BIN)/python -m benchmarks.registration
+	$(BIN)/python -m benchmarks.poses
+
+bench-sections: setup  ## sections alone: the thesis' grid by both methods, sigmas, airfoils, time
+	$(BIN)/python -m benchmarks.sections
+	$(BIN)/python -m benchmarks.thesis_sections
+
+bench-twin: setup  ## twin and repair alone: section 5.5, six kinds of wear, volumes, peers
+	$(BIN)/python -m benchmarks.twin
+	$(BIN)/python -m benchmarks.repair
+
+campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenario, all seeds of the twin
+	$(BIN)/python -m benchmarks.registration --full
+	$(BIN)/python -m benchmarks.poses 1000
+	$(BIN)/python -m benchmarks.twin --full
+	$(BIN)/python -m benchmarks.thesis_twin --full
+	$(BIN)/python -m benchmarks.repair 10
 
 picture: setup  ## redraw the picture of the screen in the README
 	$(BIN)/python -m tests.station.tui.picture docs/screen.png

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geometry.types import Measurand, Measured
+from geometry.types import Measurand, Measured, NotMeasured
 from station.software import software_commit, software_version
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from geometry.blade_line import BladeLine
     from geometry.coverage import ZoneCoverage
     from geometry.damage import Damage
+    from geometry.datums import ServiceMotion
     from geometry.register import Alignment
     from geometry.repair import Patch
     from station.findings import Finding
@@ -55,6 +56,7 @@ def document(measurement: Measurement, verdict: Verdict, plan: BladePlan, inputs
         "revision": plan.revision,
         "serial": inputs.serial,
         "alignment": alignment_of(measurement.alignment),
+        "service_motion": service_of(measurement.service),
         "sections": [section_of(section) for section in measurement.sections],
         "blade": blade_of(measurement.line),
         "form": values_of({"deviation_mm": measurement.form_mm}),
@@ -104,6 +106,7 @@ def alignment_of(alignment: Alignment | None) -> Json | None:
         "T_nominal_scan": alignment.T_nominal_scan.tolist(),
         "pivot_mm": alignment.pivot_mm.tolist(),
         "information": alignment.information.tolist(),
+        "form_covariance": alignment.form_covariance.tolist(),
         "rms_mm": alignment.rms_mm,
         "noise_mm": alignment.noise_mm,
         "inlier_fraction": alignment.inlier_fraction,
@@ -113,6 +116,16 @@ def alignment_of(alignment: Alignment | None) -> Json | None:
         "iterations": alignment.iterations,
         "converged": alignment.converged,
     }
+
+
+def service_of(service: ServiceMotion | NotMeasured | None) -> Json | None:
+    """Bend and twist of the airfoil against its root; null where the plan names no datum zone."""
+    match service:
+        case None:
+            return None
+        case NotMeasured(reason=reason):
+            return {"not_measured": {"service_motion": reason}}
+    return values_of({field.name: getattr(service, field.name) for field in fields(service)})
 
 
 def finite(value: float) -> float | None:

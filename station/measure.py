@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from geometry.airfoil import Section, measure_sections, with_damages
+from geometry.airfoil import Section, with_damages
 from geometry.blade_line import blade_line
 from geometry.clean import CleanSettings, clean
 from geometry.coverage import measure_coverage
@@ -21,12 +21,13 @@ from geometry.damage import Damage, DamageKind, DamageSettings, detection_limit,
 from geometry.errors import CannotMeasure
 from geometry.fuse import fuse, overlaps
 from geometry.nominal import Nominal
-from geometry.register import Alignment, RegisterSettings, mask_damage, register
+from geometry.register import Alignment, mask_damage
 from geometry.repair import RepairVolume, find_repairs
 from geometry.transforms import apply
-from geometry.twin import Twin, TwinSettings, fit_twin
+from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Measured, NotMeasured, View, Zone
 from station.measurement import NO_TWIN, Measurement
+from station.methods import align, cut_sections, make_twin
 from station.recipe import Recipe
 
 T = TypeVar("T")
@@ -69,9 +70,10 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
     """The procedure. A step that lacks what an earlier one should have given does not run."""
     nominal = recipe.nominal
     points = run.step("clean", clean, cloud, CleanSettings())
-    alignment = run.step("register", register, points, nominal, RegisterSettings())
+    aligned = run.step("register", align, points, recipe)
+    alignment = aligned.alignment if aligned else None
     mask = run.step("mask", mask_damage, points, alignment, nominal)
-    twin = run.step("twin", fit_twin, points, mask, alignment, nominal, TwinSettings())
+    twin = run.step("twin", make_twin, points, mask, alignment, recipe)
     damages = run.step("damage", find_damages, points, mask, alignment, nominal, twin, DamageSettings())
     detection = run.step("detection", detection_limit, points, twin, DamageSettings())
     repairs = run.step("repair", find_repairs, twin, points, alignment, damages, recipe.repair_settings)
@@ -94,6 +96,7 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
     return replace(
         found,
         alignment=alignment,
+        service=aligned.service if aligned else None,
         aligned_mm=shown[0] if shown else found.aligned_mm,
         deviation_mm=shown[1] if shown else found.deviation_mm,
         sections=sections or (),
@@ -167,9 +170,7 @@ def inspected(
     """The sections, measured on all metal that no limit of damage judges."""
     if twin is not None and damages is not None:
         mask = damaged_metal(mask, twin, damages)
-    sections = measure_sections(
-        points, mask, alignment, recipe.nominal, recipe.plan.sections.z_mm, recipe.section_settings
-    )
+    sections = cut_sections(points, mask, alignment, recipe)
     if damages is None:
         return sections
     spans = [

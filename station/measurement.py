@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # the rooms behind these types are heavy, and who only judges
     from geometry.blade_line import BladeLine
     from geometry.coverage import ZoneCoverage
     from geometry.damage import Damage
+    from geometry.datums import ServiceMotion
     from geometry.register import Alignment
     from geometry.repair import RepairVolume
     from geometry.types import Mesh
@@ -39,6 +40,7 @@ class Measurement:
     """What is not there was not measured: `failures` names the step and says why.
 
     `None` and an empty tuple differ: `damages` is None when nobody could look, empty when none was found.
+    `service` is how the airfoil stands against its root, where the plan names a datum zone.
     `aligned_mm` (n, 3) is the cleaned scan in the nominal frame, `deviation_mm` (n,) its signed distance
     to the nominal, positive outside. `detection_mm` is the depth of damage that is surely found in a
     zone. `residual_mm` is what the twin leaves of the sound points: noise, without the form of the part.
@@ -47,6 +49,7 @@ class Measurement:
 
     points: int  # as read, before cleaning
     alignment: Alignment | None = None
+    service: ServiceMotion | NotMeasured | None = None
     aligned_mm: Floats = field(default_factory=lambda: NO_POINTS)
     deviation_mm: Floats = field(default_factory=lambda: NO_VALUES)
     sections: tuple[Section, ...] = ()

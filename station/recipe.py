@@ -11,12 +11,15 @@ from geometry.airfoil import SectionSettings
 from geometry.calibrate import AxisCalibration
 from geometry.chart import FitSettings
 from geometry.coverage import CoverageSettings
+from geometry.datums import DatumSettings
 from geometry.errors import BadInput
 from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
 from geometry.repair import RepairSettings
 from station.config import Calibration
 from station.measurement import Outline
 from station.plans import BadPlan, BladePlan, check_span
+
+OFF_NOMINAL_MM = DatumSettings().off_nominal_mm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,7 +63,6 @@ class Recipe:
 
 def prepare_recipe(plan: BladePlan, axis: AxisCalibration | None = None) -> Recipe:
     """The recipe of a plan; raises `BadPlan` where the plan contradicts its nominal or what can be done."""
-    check_choices(plan)
     plan_sha256, nominal_sha256 = (
         hashlib.sha256(path.read_bytes()).hexdigest() for path in (plan.path, plan.nominal_path)
     )
@@ -68,6 +70,7 @@ def prepare_recipe(plan: BladePlan, axis: AxisCalibration | None = None) -> Reci
         mesh = read_nominal(plan.nominal_path, plan.units)
         check_span(plan, float(mesh.vertices_mm[:, 2].min()), float(mesh.vertices_mm[:, 2].max()))
         nominal = prepare_nominal(mesh, nominal_settings(plan))
+        check_datum(plan, nominal)
         outlines = tuple(outline(nominal, z_mm) for z_mm in plan.sections.z_mm)
     except BadInput as error:
         raise BadPlan(plan.path, str(error), "nominal") from error
@@ -101,19 +104,15 @@ def nominal_settings(plan: BladePlan) -> NominalSettings:
     )
 
 
-def check_choices(plan: BladePlan) -> None:
-    """Raise `BadPlan` for a choice that a plan may name and this version does not offer."""
-    offered = {
-        "alignment.method": (plan.alignment.method, "airfoil"),
-        "algorithms.registration": (plan.algorithms.registration, "default"),
-        "algorithms.sections": (plan.algorithms.sections, "default"),
-        "algorithms.twin": (plan.algorithms.twin, "default"),
-    }
-    for where, (wanted, ours) in offered.items():
-        if wanted != ours:
-            raise BadPlan(plan.path, f'"{wanted}" is not offered by this version, only "{ours}"', where)
-    if plan.repair.allowance_mm > 0.0:
-        raise BadPlan(plan.path, "an allowance is not offered by this version", "repair.allowance_mm")
+def check_datum(plan: BladePlan, nominal: Nominal) -> None:
+    """Raise `BadPlan` unless the six datum points lie on the nominal."""
+    points_mm = np.array(plan.alignment.points_mm or np.empty((0, 3)))
+    for point, off_mm in zip(points_mm, nominal.closest(points_mm).distance_mm, strict=True):
+        if not abs(off_mm) <= OFF_NOMINAL_MM:
+            place = ", ".join(f"{x:g}" for x in point)
+            raise BadPlan(
+                plan.path, f"[{place}] is {abs(off_mm):.2f} mm off the nominal", "alignment.points_mm"
+            )
 
 
 def axis_of(calibration: Calibration) -> AxisCalibration:

@@ -127,22 +127,15 @@ def test_a_section_off_the_nominal_is_refused(folder: Path, tmp_path: Path) -> N
         )
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "where"),
-    [
-        ("[sections]", '[algorithms]\ntwin = "thesis"\n[sections]', "algorithms.twin"),
-        ("[sections]", '[alignment]\nmethod = "six_point"\n[sections]', "alignment.method"),
-    ],
-)
-def test_a_choice_that_is_not_offered_is_refused_not_ignored(
-    folder: Path, old: str, new: str, where: str
-) -> None:
+def test_a_datum_point_off_the_nominal_is_a_bad_plan(folder: Path) -> None:
     from station.plans import read_plan
 
-    (folder / "choice.toml").write_text(PLAN.replace(old, new))
-    with pytest.raises(BadPlan) as caught:
-        prepare_recipe(read_plan(folder / "choice.toml"))
-    assert caught.value.where == where
+    points = [[0.0, 0.0, 0.0]] * 5 + [[0.0, 0.0, 400.0]]
+    table = f'[alignment]\nmethod = "six_point"\npoints_mm = {points}\n[sections]'
+    (folder / "datum.toml").write_text(PLAN.replace("[sections]", table))
+    with pytest.raises(BadPlan, match="mm off the nominal") as caught:
+        prepare_recipe(read_plan(folder / "datum.toml"))
+    assert caught.value.where == "alignment.points_mm"
 
 
 def test_what_is_at_fault_writes_nothing(folder: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from geometry.types import Cloud, Measurand, NotMeasured, View, Zone
 from station import measure
 from station.gates import Acceptance
 from station.measure import Run, Views, absorb, as_cloud, conclude, measure_cloud
+from station.methods import Aligned
 from station.recipe import Recipe
 from station.verdict import Word, judge
 from tests.station.parts import (
@@ -67,13 +68,14 @@ def geometry(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     given: dict[str, Any] = {
         "fuse": as_cloud(POINTS, 0.015),
         "overlaps": (),
-        "register": alignment(),
+        "align": Aligned(alignment=alignment(), service=None),
         "mask_damage": np.zeros(4, bool),
-        "fit_twin": twin,
+        "make_twin": twin,
         "find_damages": (),
         "detection_limit": measurement().detection_mm,
         "find_repairs": repairs(),
-        "measure_sections": (section(),),
+        "cut_sections": (section(),),
+        "blade_line": None,
         "measure_coverage": measurement().zones,
     }
 
@@ -105,6 +107,7 @@ EVERY_STEP = [
     "detection",
     "repair",
     "sections",
+    "line",
     "coverage",
     "deviation",
 ]
@@ -121,16 +124,16 @@ def test_every_step_is_heard_timed_and_kept(geometry: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("broken", "step", "left"),
     [
-        ("register", "register", ["clean", "register"]),
+        ("align", "register", ["clean", "register"]),
         ("mask_damage", "mask", ["clean", "register", "mask", "deviation"]),
-        ("fit_twin", "twin", ["clean", "register", "mask", "twin", "sections", "coverage", "deviation"]),
+        ("make_twin", "twin", [step for step in EVERY_STEP if step not in ("damage", "detection", "repair")]),
         (
             "find_damages",
             "damage",
-            ["clean", "register", "mask", "twin", "damage", "detection", "sections", "coverage", "deviation"],
+            [step for step in EVERY_STEP if step != "repair"],
         ),
         ("find_repairs", "repair", EVERY_STEP),
-        ("measure_sections", "sections", EVERY_STEP),
+        ("cut_sections", "sections", [step for step in EVERY_STEP if step != "line"]),
         ("measure_coverage", "coverage", EVERY_STEP),
     ],
 )
@@ -147,7 +150,7 @@ def test_a_step_that_cannot_measure_is_named_and_holds(
 
 
 def test_without_registration_there_is_nothing_else(geometry: dict[str, Any]) -> None:
-    geometry["register"] = CannotMeasure("too few")
+    geometry["align"] = CannotMeasure("too few")
     done = measured().done
     assert (done.alignment, done.damages, done.repairs) == (None, None, None)
     assert (done.zones, done.sections) == ((), ())
@@ -159,7 +162,7 @@ def test_a_bug_is_not_an_unmeasured_part(geometry: dict[str, Any], monkeypatch: 
     def broken(*_: object) -> None:
         raise IndexError("out of bounds")
 
-    monkeypatch.setattr(measure, "register", broken)
+    monkeypatch.setattr(measure, "align", broken)
     with pytest.raises(IndexError):
         measured()
 
@@ -206,19 +209,19 @@ def test_views_need_the_axis() -> None:
 
 def test_only_a_damage_that_touches_excuses_a_section(geometry: dict[str, Any]) -> None:
     torn = section(7.0, chord_mm=lost("masked", in_damage=True))
-    geometry["measure_sections"] = (torn,)
+    geometry["cut_sections"] = (torn,)
     unexcused = measured().done.sections[0].measurands["chord_mm"]
     assert unexcused == NotMeasured(reason="masked, but no damage was found there")
     geometry["find_damages"] = (replace(damage(Zone.LEADING_EDGE), points=np.array([3])),)
     assert not measured().done.sections[0].measurands["chord_mm"].in_damage  # the damage is at 90 mm
-    geometry["measure_sections"] = (replace(torn, z_mm=90.4),)
+    geometry["cut_sections"] = (replace(torn, z_mm=90.4),)
     excused = measured().done.sections[0]
     assert excused.measurands["chord_mm"].in_damage
     assert excused.status == SectionStatus.IN_DAMAGE
 
 
 def test_a_lost_tip_reaches_to_the_end_of_the_span(geometry: dict[str, Any]) -> None:
-    geometry["measure_sections"] = (section(103.0, chord_mm=lost()),)
+    geometry["cut_sections"] = (section(103.0, chord_mm=lost()),)
     geometry["find_damages"] = (replace(damage(Zone.TIP), points=np.array([3])),)
     assert measured().done.sections[0].measurands["chord_mm"].in_damage
     geometry["find_damages"] = (replace(damage(Zone.TIP, DamageKind.EXCESS), points=np.array([3])),)
@@ -226,7 +229,7 @@ def test_a_lost_tip_reaches_to_the_end_of_the_span(geometry: dict[str, Any]) -> 
 
 
 def test_a_patch_reaches_beyond_the_points(geometry: dict[str, Any]) -> None:
-    geometry["measure_sections"] = (section(1.4, chord_mm=lost()),)
+    geometry["cut_sections"] = (section(1.4, chord_mm=lost()),)
     geometry["find_damages"] = (replace(damage(Zone.SURFACE), points=np.array([2])),)  # at 3 mm
     assert not measured().done.sections[0].measurands["chord_mm"].in_damage
     geometry["find_repairs"] = repairs(patch(0))  # from 0 to 1 mm
@@ -242,9 +245,9 @@ def test_bent_metal_is_measured_by_sections(
         masks.append(mask.tolist())
         return (section(90.0, chord_mm=lost(in_damage=True)),)
 
-    monkeypatch.setattr(measure, "measure_sections", sections)
+    monkeypatch.setattr(measure, "cut_sections", sections)
     geometry["mask_damage"] = np.array([False, True, True, True])
-    geometry["fit_twin"].sound = np.array([True, True, False, False])
+    geometry["make_twin"].sound = np.array([True, True, False, False])
     bent = replace(damage(kind=DamageKind.DEFORMATION), points=np.array([3]))
     broken = replace(damage(Zone.SURFACE, depth=0.1), points=np.array([0]))
     geometry["find_damages"] = (bent, broken)
@@ -279,7 +282,7 @@ def test_a_run_keeps_time_even_of_what_failed() -> None:
 
 
 def test_noise_is_told_by_the_twin_when_there_is_one(geometry: dict[str, Any]) -> None:
-    geometry["register"] = alignment(noise_mm=0.08)  # the form of a worn blade
+    geometry["align"] = Aligned(alignment=alignment(noise_mm=0.08), service=None)  # the form of a worn blade
     done = measured().done
     assert done.residual_mm == 0.012
     assert judge(done, plan(), GATES, Acceptance()).verdict == Word.PASS

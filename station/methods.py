@@ -1,0 +1,96 @@
+"""The verbs of the geometry that a plan chooses by name, each with the settings of that plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.airfoil import Section, measure_sections
+from geometry.datums import (
+    ServiceMotion,
+    register_root,
+    register_sections,
+    register_six_point,
+    service_motion,
+)
+from geometry.errors import CannotMeasure
+from geometry.nominal import Nominal
+from geometry.register import Alignment, register
+from geometry.thesis.fine_tuned import register_thesis
+from geometry.thesis.rwlls_sections import ThesisSectionSettings, measure_sections_thesis
+from geometry.thesis.stiff_twin import fit_twin_thesis
+from geometry.twin import Twin, TwinSettings, fit_twin
+from geometry.types import Bools, Cloud, NotMeasured
+from station.plans import AlignmentChoice
+from station.recipe import Recipe
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Aligned:
+    """The alignment that everything is judged by, and how the airfoil stands against its root in service.
+
+    `service` is None where the plan names no datum zone.
+    """
+
+    alignment: Alignment
+    service: ServiceMotion | NotMeasured | None
+
+
+def align(cloud: Cloud, recipe: Recipe) -> Aligned:
+    """The fit on the airfoil, then the one on the datum that the plan names.
+
+    Raises `CannotRegister` for a datum on damage or unseen; without the root zone only `service` is lost.
+    """
+    choice, nominal = recipe.plan.alignment, recipe.nominal
+    service: ServiceMotion | NotMeasured
+    thesis = recipe.plan.algorithms.registration == "thesis"
+    airfoil = register_thesis(cloud, nominal) if thesis else register(cloud, nominal)
+    alignment = on_datum(cloud, airfoil, nominal, choice)
+    if choice.datum_z_mm is None:
+        return Aligned(alignment=alignment, service=None)
+    try:
+        service = in_service(cloud, airfoil, nominal, choice.datum_z_mm)
+    except CannotMeasure as why:
+        service = NotMeasured(reason=str(why))
+    return Aligned(alignment=alignment, service=service)
+
+
+def in_service(
+    cloud: Cloud, airfoil: Alignment, nominal: Nominal, datum_z_mm: tuple[float, float]
+) -> ServiceMotion | NotMeasured:
+    """How the airfoil stands against its root; only where the root zone tells a whole pose."""
+    root = register_root(cloud, nominal, airfoil, datum_z_mm)
+    if root.weak_directions or not root.converged:
+        return NotMeasured(reason="the datum zone leaves a direction free")
+    return service_motion(root, airfoil, nominal)
+
+
+def on_datum(cloud: Cloud, airfoil: Alignment, nominal: Nominal, choice: AlignmentChoice) -> Alignment:
+    """The alignment that the plan judges by, found from the fit on the whole airfoil."""
+    match choice.method:
+        case "root" if choice.datum_z_mm is not None:
+            return register_root(cloud, nominal, airfoil, choice.datum_z_mm)
+        case "six_point" if choice.points_mm is not None:
+            return register_six_point(cloud, nominal, airfoil, np.array(choice.points_mm))
+        case "sections" if choice.z_mm is not None:
+            return register_sections(cloud, nominal, airfoil, choice.z_mm)
+        case "airfoil":
+            return airfoil
+    raise ValueError(f"alignment {choice.method} without its datum")
+
+
+def make_twin(cloud: Cloud, mask: Bools, alignment: Alignment, recipe: Recipe) -> Twin:
+    """The damage-free twin by the method of the plan."""
+    if recipe.plan.algorithms.twin == "thesis":
+        return fit_twin_thesis(cloud, mask, alignment, recipe.nominal)
+    return fit_twin(cloud, mask, alignment, recipe.nominal, TwinSettings())
+
+
+def cut_sections(cloud: Cloud, mask: Bools, alignment: Alignment, recipe: Recipe) -> tuple[Section, ...]:
+    """The sections of the plan by the method of the plan."""
+    settings, z_mm = recipe.section_settings, recipe.plan.sections.z_mm
+    if recipe.plan.algorithms.sections == "thesis":
+        thesis = ThesisSectionSettings(sections=settings)
+        return measure_sections_thesis(cloud, mask, alignment, recipe.nominal, z_mm, thesis)
+    return measure_sections(cloud, mask, alignment, recipe.nominal, z_mm, settings)
