@@ -6,7 +6,7 @@ import numpy as np
 
 from geometry.errors import BadInput
 from geometry.kernels.graph import component_sizes, only_mutual
-from geometry.kernels.neighbours import k_nearest
+from geometry.kernels.neighbours import in_cell_order, k_nearest
 from geometry.kernels.quadric import plane_heights
 from geometry.types import Bools, Cloud, Floats, Ints
 
@@ -27,7 +27,8 @@ class CleanSettings:
 
 
 def clean(cloud: Cloud, settings: CleanSettings = CleanSettings()) -> Cloud:
-    """The measured points that lie on a surface, thinned to at most `most_points`, none moved.
+    """The measured points that lie on a surface, thinned to at most `most_points`, none moved,
+    in an order that keeps neighbours together: every later step walks the cloud faster so.
 
     Flying pixels and isolated clusters go first, then points off the plane of their neighbours where these
     agree among themselves: at an edge they do not, so edges stay. A cloud too small to judge is returned
@@ -35,6 +36,7 @@ def clean(cloud: Cloud, settings: CleanSettings = CleanSettings()) -> Cloud:
     """
     if len(cloud) <= 2 * settings.neighbours:
         return cloud
+    cloud = _select(cloud, in_cell_order(cloud.points_mm))
     nearest, distance_mm = k_nearest(cloud.points_mm, settings.neighbours + 1)
     strays = _strays(nearest, distance_mm, settings)
     return _thin(_select(cloud, ~(strays | _outliers(cloud, nearest, settings))), settings.most_points)
