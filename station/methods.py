@@ -14,16 +14,19 @@ from geometry.datums import (
     register_six_point,
     service_motion,
 )
-from geometry.errors import CannotMeasure
+from geometry.errors import CannotMeasure, CannotRegister
 from geometry.nominal import Nominal
 from geometry.register import Alignment, register
 from geometry.thesis.fine_tuned import register_thesis
 from geometry.thesis.rwlls_sections import ThesisSectionSettings, measure_sections_thesis
 from geometry.thesis.stiff_twin import fit_twin_thesis
+from geometry.transforms import apply, inverse
 from geometry.twin import Twin, TwinSettings, fit_twin
 from geometry.types import Bools, Cloud, NotMeasured
 from station.plans import AlignmentChoice
 from station.recipe import Recipe
+
+AGREED_MM = 0.05  # anywhere on the surface, between two ways to the same pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,8 +47,9 @@ def align(cloud: Cloud, recipe: Recipe) -> Aligned:
     """
     choice, nominal = recipe.plan.alignment, recipe.nominal
     service: ServiceMotion | NotMeasured
-    thesis = recipe.plan.algorithms.registration == "thesis"
-    airfoil = register_thesis(cloud, nominal) if thesis else register(cloud, nominal)
+    airfoil = register(cloud, nominal)
+    if recipe.plan.algorithms.registration == "thesis":
+        airfoil = agreeing(register_thesis(cloud, nominal), airfoil, nominal)
     alignment = on_datum(cloud, airfoil, nominal, choice)
     if choice.datum_z_mm is None:
         return Aligned(alignment=alignment, service=None)
@@ -54,6 +58,20 @@ def align(cloud: Cloud, recipe: Recipe) -> Aligned:
     except CannotMeasure as why:
         service = NotMeasured(reason=str(why))
     return Aligned(alignment=alignment, service=service)
+
+
+def agreeing(thesis: Alignment, default: Alignment, nominal: Nominal) -> Alignment:
+    """The thesis' pose, where the default's is the same; raises `CannotRegister` otherwise.
+
+    Pairs of points hold a blade along its own screw by their spacing alone. Nothing that the thesis' method
+    knows of its pose shows such a slide.
+    """
+    points_mm = nominal.samples.points_mm
+    moved_mm = apply(thesis.T_nominal_scan @ inverse(default.T_nominal_scan), points_mm) - points_mm
+    off_mm = float(np.linalg.norm(moved_mm, axis=1).max())
+    if not off_mm <= AGREED_MM:
+        raise CannotRegister(f"the thesis' pose lies {off_mm:.2f} mm off the one that the ends confirm")
+    return thesis
 
 
 def in_service(

@@ -127,6 +127,21 @@ def test_a_section_off_the_nominal_is_refused(folder: Path, tmp_path: Path) -> N
         )
 
 
+def test_a_slide_of_the_thesis_registration_is_never_believed(folder: Path, tmp_path: Path) -> None:
+    plan = folder / "thesis.toml"
+    plan.write_text(PLAN.replace("[sections]", '[algorithms]\nregistration = "thesis"\n[sections]'))
+    done = inspect_scan(
+        plan,
+        folder / "cut.ply",
+        tmp_path,
+        serial="SN-1",
+        clock=time.perf_counter,
+        progress=lambda step: None,
+    )
+    assert done.verdict.verdict == "HOLD"
+    assert "off the one that the ends confirm" in done.verdict.reasons[0]
+
+
 def test_a_datum_point_off_the_nominal_is_a_bad_plan(folder: Path) -> None:
     from station.plans import read_plan
 

@@ -9,6 +9,7 @@ import pytest
 from geometry.chart import SectionSettings
 from geometry.datums import ServiceMotion
 from geometry.errors import CannotRegister
+from geometry.transforms import about_z, rigid
 from geometry.types import NotMeasured
 from station import methods
 from station.measure import as_cloud
@@ -24,7 +25,12 @@ MOTION = ServiceMotion(
 
 
 def recipe(**tables: Any) -> Any:
-    return SimpleNamespace(plan=plan(**tables), nominal=None, section_settings=SectionSettings())
+    samples = SimpleNamespace(points_mm=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0]]))
+    return SimpleNamespace(
+        plan=plan(**tables),
+        nominal=SimpleNamespace(samples=samples),
+        section_settings=SectionSettings(),
+    )
 
 
 @pytest.fixture
@@ -94,7 +100,7 @@ def test_a_root_zone_that_is_not_enough_costs_its_numbers_only(
         ({}, ["register", "fit_twin", "measure_sections"]),
         (
             dict.fromkeys(("registration", "twin", "sections"), "thesis"),
-            ["register_thesis", "fit_twin_thesis", "measure_sections_thesis"],
+            ["register", "register_thesis", "fit_twin_thesis", "measure_sections_thesis"],
         ),
     ],
 )
@@ -106,3 +112,11 @@ def test_each_method_can_be_the_thesis_own(
     make_twin(CLOUD, mask, found, wanted)
     cut_sections(CLOUD, mask, found, wanted)
     assert [name for name, _ in called] == verbs
+
+
+@pytest.mark.usefixtures("called")
+def test_a_pose_of_the_thesis_that_slid_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    slid = rigid(about_z(0.02)[:3, :3], np.array([0.0, 0.0, 0.06]))
+    monkeypatch.setattr(methods, "register_thesis", lambda *_: alignment(T_nominal_scan=slid))
+    with pytest.raises(CannotRegister, match=r"0\.06 mm off the one that the ends confirm"):
+        align(CLOUD, recipe(algorithms={"registration": "thesis"}))
