@@ -14,7 +14,7 @@ from geometry.repair import RepairSettings, find_repairs
 from geometry.types import Zone
 from tests.geometry import repair_blades as blades
 
-NOISES_MM = (0.0, 0.015, 0.03)
+NOISES_MM = (0.0, 0.02)
 CASES: dict[str, tuple[Zone, Callable[[], Any]]] = {
     "tip corner, 3 mm": (Zone.TIP, lambda: blades.tip_corner_cutter(3.0)),
     "tip corner, 5 mm": (Zone.TIP, lambda: blades.tip_corner_cutter(5.0)),

@@ -22,7 +22,7 @@ def k_nearest(points_mm: Floats, k: int) -> tuple[Ints, Floats]:
 
 
 def in_cell_order(points_mm: Floats) -> Ints:
-    """An order (n,) in which points next to each other are near in space: what walks them stays in the cache."""
+    """An order (n,) in which neighbours follow each other: what walks the points so stays in the cache."""
     *_, order = _grid(points_mm, 12)
     return order
 

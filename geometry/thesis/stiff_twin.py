@@ -27,7 +27,7 @@ from geometry.thesis.region_growing import RegionGrowingSettings, grow_damage
 from geometry.thesis.stiffness import Stiffness, factor_patches, prepare_stiffness, solve_stiff
 from geometry.transforms import apply
 from geometry.twin import Twin
-from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Mesh
+from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh, NotMeasured
 
 CANDIDATES, SECTORS, PER_SECTOR = 30, 8, 2  # of a scan point's neighbourhood, as in the registration
 FITTED = TERMS / (1 + SECTORS * PER_SECTOR)  # share of the noise that a quadric takes up
@@ -38,6 +38,7 @@ SOLVED = 0.1  # of the inner threshold: how far the equations are solved
 SEEN_REACH = 1.5  # spacings of the scan: a CAD point with no scan point so near is not seen
 START_REACH = 3.0  # CAD spacings: before it moves, a CAD point with no scan point so near has none
 SHARERS = 3  # CAD points that may share a scan point and still be seen by it
+RIM_RINGS = 2  # of CAD points at the rim of what is seen take no part in the form
 FORGET_MM = 3.0  # beyond what is seen, over which the form may change altogether
 RMS_POINTS = 50_000  # of the scan, to compare with the twin
 LEAST_EDGE_MM = 1.0  # the twin's mesh is halved no finer
@@ -374,13 +375,23 @@ def _at_vertices(mesh: Mesh, nodes: Nodes, moves_mm: Floats) -> Floats:
     return np.asarray(result)
 
 
+def _inner(seen: Bools, stiffness: Stiffness) -> Bools:
+    """Seen points (n,) whose neighbours, and theirs, are seen: at a rim quadrics are one-sided and tilt."""
+    inner = seen
+    for _ in range(RIM_RINGS):
+        inner = inner & np.minimum.reduceat(inner[stiffness.columns], stiffness.offsets[:-1])
+    return inner
+
+
 def _form(
     ground: _Ground, matched: _Matched, seen: Bools, seen_sigma_mm: float, alignment: Alignment
-) -> Measurand:
-    """Largest |twin - nominal| along the normal where it is seen; its sigma includes the pose's."""
-    nodes = ground.nodes
+) -> Measured:
+    """Largest |twin - nominal| along the normal where it is well seen; its sigma includes the pose's."""
+    nodes, inner = ground.nodes, _inner(seen, ground.stiffness)
+    if not inner.any():
+        return NotMeasured(reason="no sound surface")
     along_mm = np.einsum("nj,nj->n", matched.moved_mm - nodes.points_mm, nodes.normals)
-    worst = int(np.argmax(np.where(seen, np.abs(along_mm), -1.0)))
+    worst = int(np.argmax(np.where(inner, np.abs(along_mm), -1.0)))
     arm_mm, normal = nodes.points_mm[worst] - alignment.pivot_mm, nodes.normals[worst]
     lever = np.concatenate([np.cross(arm_mm, normal), normal])
     pose_mm2 = float(lever @ np.linalg.pinv(alignment.information, rcond=1e-14, hermitian=True) @ lever)
