@@ -27,7 +27,8 @@ from geometry.kernels.profile_spline import (
 from geometry.types import Bools, Floats
 
 _PILOT_POINTS = 10_000  # of a band, to tell outliers
-_BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # a start: curvature of sides, of edges, along the span
+_BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # of what is told from outliers: sides, edges, along the span
+_START = np.array([5e4, 2e4, 4e6])  # of the search for the strengths: those of a blade in service
 _RIGID_PRIOR = np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0  # weak: `find_motion` has taken most
 _BINS = (4, 8)  # in each knot span along the arc, and across
 _LIKELIER = 9.0  # twice the gain in log likelihood
@@ -45,7 +46,7 @@ class Knots:
 
     def u(self, node: Floats) -> Floats:
         """Knot spans of node coordinates."""
-        return node * (self.p / NODES) % self.p
+        return node * (self.p / NODES)
 
     def v(self, z_mm: Floats) -> Floats:
         """Knot spans of heights."""
@@ -175,8 +176,8 @@ def onto_chart(
     back = motion.undo(points_mm)
     foot = chart.project(back)
     steep = np.abs(chart.steepness(foot[:, 0], back[:, 2]))
-    near = (steep <= settings.steepest) & (np.abs(foot[:, 1]) <= settings.capture_mm)
-    back, foot, steep = back[near], foot[near], steep[near]
+    near = np.flatnonzero((steep <= settings.steepest) & (np.abs(foot[:, 1]) <= settings.capture_mm))
+    back, foot, steep = (each.take(near, axis=0) for each in (back, foot, steep))
     height = (back[:, 2] - chart.section_z_mm) / settings.band_mm
     return Band(
         node=foot[:, 0],
@@ -194,18 +195,19 @@ def robust_fit(
     What is kept is decided on a share of the points and a fixed smoothness; the last fit takes them all.
     """
     knots = place_knots(chart, span_mm, settings)
-    penalty, start = _penalty(chart, knots, settings), _BENDING_PER_MM**-2.0
+    penalty = _penalty(chart, knots, settings)
     laid = band.laid(knots)
     few = band.every(max(1, len(band.node) // _PILOT_POINTS)).laid(knots)
     keep = np.ones(len(few.u), bool)
     for limit in (2.0 * settings.outlier, settings.outlier):
-        pilot = eliminate(few.sums(keep, penalty), penalty, start)
+        pilot = eliminate(few.sums(keep, penalty), penalty, _BENDING_PER_MM**-2.0)
         coefficients = pilot.values(penalty.layout)
         misfit = few.misfit(coefficients, pilot.free)
         most = limit * 1.4826 * float(np.median(misfit))
         keep = misfit <= most
     keep = laid.misfit(coefficients, pilot.free) <= most
-    return keep, knots, _steadied(fit_spline(laid.sums(keep, penalty), penalty, start), knots, chart.curve_mm)
+    fit = fit_spline(laid.sums(keep, penalty), penalty, _START)
+    return keep, knots, _steadied(fit, knots, chart.curve_mm)
 
 
 def _steadied(fit: SplineFit, knots: Knots, nominal_mm: Floats) -> SplineFit:

@@ -109,21 +109,25 @@ def flat(curve_mm: Floats, end: Edge, flat_mm: float) -> Estimate:
     node, room = node[1:-1], room[1:-1]
     half = room[:, None] * np.linspace(0.0, 1.0, _SPANS + 1)[1:]
     bows = edge.bows(node, half)
-    widest = [_crossing(*row, flat_mm) for row in zip(half, bows.bulge_mm, strict=True)]
-    found = edge.bows(node, np.array(widest))
+    widest = _crossing(half, bows.bulge_mm, flat_mm)
+    found = edge.bows(node, widest)
     best = int(np.argmax(found.length_mm))
-    length, bulge = edge.growth(len(curve_mm), int(node[best]), widest[best])
+    length, bulge = edge.growth(len(curve_mm), int(node[best]), float(widest[best]))
     rise, chord = float(found.bulge_mm[best]), float(found.length_mm[best])
     if rise > 0.5 * flat_mm:
         length = length - 0.5 * chord / rise * bulge  # bulge grows with the square of the length
     return Estimate(value=chord, gradient=length)
 
 
-def _crossing(half_mm: Floats, bulge_mm: Floats, flat_mm: float) -> float:
-    """The half width at which the bulge first reaches `flat_mm`; the largest one if it never does."""
-    beyond = np.flatnonzero(bulge_mm > flat_mm)
-    if len(beyond) == 0:
-        return float(half_mm[-1])
-    k = int(beyond[0])
-    low, below = (half_mm[k - 1], bulge_mm[k - 1]) if k else (0.0, 0.0)
-    return float(low + (half_mm[k] - low) * (flat_mm - below) / (bulge_mm[k] - below))
+def _crossing(half_mm: Floats, bulge_mm: Floats, flat_mm: float) -> Floats:
+    """The half width (k,) at which each bulge (k, w) first reaches `flat_mm`; the largest if never."""
+    beyond = bulge_mm > flat_mm
+    last = np.where(beyond.any(axis=1), beyond.argmax(axis=1), bulge_mm.shape[1] - 1)
+    row = np.arange(len(last))
+    before = np.maximum(last - 1, 0)
+    first = last == 0
+    low, below = (np.where(first, 0.0, each[row, before]) for each in (half_mm, bulge_mm))
+    rise = bulge_mm[row, last] - below
+    part = np.divide(flat_mm - below, rise, out=np.ones(len(row)), where=beyond.any(axis=1))
+    widest: Floats = low + (half_mm[row, last] - low) * part
+    return widest

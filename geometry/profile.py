@@ -5,6 +5,7 @@ normals (`geometry.band`). What has no points is a gap, never bridged.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -84,7 +85,7 @@ class Profile:
         return self.chart.section_z_mm
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scan:
     """The scan points in the nominal frame."""
 
@@ -92,18 +93,23 @@ class Scan:
     sigma_mm: Floats  # (n,)
     mask: Bools  # (n,) True = damaged
 
+    @cached_property
+    def sound_z_mm(self) -> Floats:
+        """Heights (n,) of the sound points, NaN for damaged ones: what each section looks through."""
+        return np.where(self.mask, np.nan, self.points_mm[:, 2])
+
 
 def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     """The profile in the chart's plane. Damaged points take no part.
 
     Raises `CannotMeasure` when too few sound points lie near the plane.
     """
-    z = scan.points_mm[:, 2]
-    low, high = band_of(chart, z[~scan.mask], settings)
-    inside = (z >= low) & (z <= high) & ~scan.mask
-    if np.count_nonzero(inside) < settings.min_points:
+    z = scan.sound_z_mm
+    low, high = band_of(chart, z, settings)
+    inside = np.flatnonzero((z >= low) & (z <= high))
+    if len(inside) < settings.min_points:
         raise CannotMeasure(f"no sound points within {settings.band_mm:g} mm of the plane")
-    sound = scan.points_mm[inside]
+    sound = scan.points_mm.take(inside, axis=0)
     motion = find_motion(chart, sound)
     band = onto_chart(sound, scan.sigma_mm[inside], chart, motion, settings)
     if len(band.node) < settings.min_points:

@@ -1,0 +1,153 @@
+"""The band's kernels against slow twins, held functions against dense conditioning, and the width chosen."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from geometry.band import band_of
+from geometry.chart import Motion, SectionSettings, curvature, rigid_columns, unroll
+from geometry.curve import centroid
+from geometry.kernels.profile import band_bins, band_misfit, nearest_nodes, steepness, tensor_values
+from geometry.kernels.profile_spline import curvature_penalty, gather, solve, stencil
+from geometry.profile import Scan, reconstruct
+from tests.geometry.airfoils import AnalyticNominal, Blade, Part
+
+P, Q = 16, 5
+SETTINGS = SectionSettings()
+NOMINAL = AnalyticNominal(Blade())
+CHART = unroll(NOMINAL, 52.5, 12.0, SETTINGS)
+
+
+@pytest.fixture
+def laid():
+    """u, v, rows (distance, arm, normal, height) and weights of 500 points."""
+    rng = np.random.default_rng(1)
+    u, v = rng.uniform(0.0, P, 500), rng.uniform(0.0, Q - 3, 500)
+    angle = rng.uniform(0.0, 6.28, 500)
+    normal = np.column_stack([np.cos(angle), np.sin(angle)])
+    rows = np.column_stack(
+        [rng.normal(size=500), rng.normal(size=(500, 2)), normal, rng.uniform(-1.0, 1.0, 500)]
+    )
+    return u, v, rows, np.where(rng.random(500) < 0.2, 0.0, rng.uniform(0.5, 2.0, 500))
+
+
+def columns_of(rows):
+    return rigid_columns(rows[:, 1:3], rows[:, 3:5], np.zeros(2), rows[:, 5])
+
+
+def test_misfit_is_the_distance_less_spline_and_rigid_columns(laid):
+    u, v, rows, _ = laid
+    coefficients, free = np.random.default_rng(2).normal(size=(P, Q)), np.arange(6.0)
+    expected = rows[:, 0] - tensor_values(u, v, coefficients) - columns_of(rows) @ free
+    assert_allclose(band_misfit(u, v, rows, coefficients, free), expected, atol=1e-12)
+
+
+def test_bins_hold_the_weighted_means_of_their_points(laid):
+    u, v, rows, weight = laid
+    bins = band_bins(u, v, rows, weight, (P, Q - 3), (2, 3))
+    every = np.column_stack([u, v, weight, rows[:, 0], columns_of(rows)])
+    at = (u * 2).astype(int) * 6 + (v * 3).astype(int)
+    expected = []
+    for b in np.unique(at[weight > 0.0]):
+        inside = (at == b) & (weight > 0.0)
+        row = np.average(every[inside], axis=0, weights=weight[inside])
+        row[2] = weight[inside].sum()
+        expected.append(row)
+    assert_allclose(bins, expected, atol=1e-12)
+
+
+def test_nearest_nodes_equal_the_search_over_all():
+    curve = CHART.curve_mm
+    moved = curve + np.random.default_rng(3).normal(0.0, 0.1, curve.shape) + np.array([0.1, -0.05])
+    found = nearest_nodes(moved, curve)
+    expected = np.linalg.norm(moved[:, None] - curve, axis=2).min(axis=1)
+    assert_allclose(np.linalg.norm(moved - curve[found], axis=1), expected, atol=2e-3)
+
+
+def test_steepness_is_that_of_the_nearest_of_the_three_sections():
+    z_mm = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    growth = np.arange(10.0).reshape(5, 2)
+    trusted = np.array([[True, True], [True, False]])
+    found = steepness(np.array([0.3, 1.9, 0.0, 1.0]), np.array([0.1, 1.2, 3.9, 3.0]), z_mm, growth, trusted)
+    assert_allclose(found, [0.0, 3.0, 8.0, np.nan])
+
+
+def test_undoing_a_motion_is_the_way_back_of_its_matrix():
+    rng = np.random.default_rng(4)
+    motion = Motion(
+        pivot_mm=np.array([1.0, 2.0]),
+        z_mm=5.0,
+        rest=np.array([0.3, -0.2, 0.04]),
+        per_mm=np.array([0.01, 0.02, 0.003]),
+    )
+    points = rng.normal(0.0, 10.0, (50, 3))
+    there = points.copy()
+    for row in there:
+        x, y, turn = motion.rest + motion.per_mm * (row[2] - 5.0)
+        matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        row[:2] = matrix @ (row[:2] - motion.pivot_mm) + motion.pivot_mm + [x, y]
+    assert_allclose(motion.undo(there), points, atol=1e-12)
+
+
+def test_held_functions_are_those_of_a_conditioned_gaussian():
+    rng = np.random.default_rng(5)
+    u, v = rng.uniform(0.0, P, 400), rng.uniform(0.0, Q - 3, 400)
+    y, columns = rng.normal(size=400), rng.normal(size=(400, 2))
+    penalty = curvature_penalty(np.arange(P) * 1.0, P * 1.0, np.arange(P) % 2, Q, 2.0)
+    fit = solve(gather(u, v, y, np.ones(400), columns, stencil(P, Q)), penalty, np.array([0.1, 0.2, 0.5]))
+    held = rng.normal(size=(P, Q, 3))
+    variance = np.array([1e-9, 0.01, 0.5])
+    ask = rng.normal(size=(P, Q, 2))
+    both = np.concatenate([ask, held], axis=2)
+    whole = fit.covariance(both, np.zeros((2, 5)))
+    values = np.einsum("pq,pqn->n", fit.coefficients, both)
+    gain = np.linalg.solve(whole[2:, 2:] + np.diag(variance), whole[2:, :2]).T
+    told = fit.held(held, variance)
+    assert_allclose(np.einsum("pq,pqn->n", told.coefficients, ask), values[:2] - gain @ values[2:], rtol=1e-6)
+    assert_allclose(
+        told.covariance(ask, np.zeros((2, 2))), whole[:2, :2] - gain @ whole[2:, :2], rtol=1e-6, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("spacing_mm", "half_mm"), [(0.05, 6.0), (0.15, 9.0), (0.5, 12.0)])
+def test_the_sparser_the_scan_the_wider_the_band(spacing_mm, half_mm):
+    count = round(24.0 * CHART.perimeter_mm / spacing_mm**2)
+    low, high = band_of(CHART, np.random.default_rng(0).uniform(40.5, 64.5, count), SETTINGS)
+    assert (low, high) == pytest.approx((52.5 - half_mm, 52.5 + half_mm), abs=0.2)
+
+
+def test_a_band_ends_where_its_chart_ends():
+    chart = unroll(NOMINAL, 3.0, 12.0, SETTINGS)
+    assert band_of(chart, np.empty(0), SETTINGS) == pytest.approx((0.0, 15.0))
+
+
+def test_curvature_of_a_circle():
+    t = 2.0 * np.pi * np.arange(200) / 200
+    assert_allclose(curvature(0.5 * np.column_stack([np.cos(t), np.sin(t)])), 2.0, rtol=1e-9)
+
+
+def test_centroids_are_within_the_thesis_table_where_it_is_tightest():
+    """Table 4.4, noise 0.010 mm: 0.000703 mm at a spacing of 0.2 mm."""
+    part = Part(deviation=lambda s, z: 0.003 * np.sin(2 * np.pi * 6 * s + 0.05 * z))
+    true = centroid(part.section(52.5))
+    for seed in range(6):
+        points = part.scan(np.random.default_rng(seed), 40.5, 64.5, 0.2, 0.010)
+        clear = np.zeros(len(points), bool)
+        profile = reconstruct(
+            Scan(points_mm=points, sigma_mm=np.full(len(points), 0.01), mask=clear), CHART, SETTINGS
+        )
+        assert np.linalg.norm(centroid(profile.curve_mm) - true) < 0.000703
+
+
+def test_the_motion_of_a_bent_blade_is_followed():
+    """Bending that curves along the span, 0.04 mm over the band: its motion is not straightened."""
+    rng = np.random.default_rng(7)
+    points = Part().scan(rng, 40.5, 64.5, 0.15, 0.01)
+    points[:, 1] += 3e-4 * (points[:, 2] - 30.0) ** 2
+    profile = reconstruct(
+        Scan(points_mm=points, sigma_mm=np.full(len(points), 0.01), mask=np.zeros(len(points), bool)),
+        CHART,
+        SETTINGS,
+    )
+    true = centroid(Part().section(52.5)) + np.array([0.0, 3e-4 * 22.5**2])
+    assert np.abs(centroid(profile.curve_mm) - true).max() < 0.0015
