@@ -60,7 +60,8 @@ def hollows(limits: float, spacings: float, pitch_mm: float, noise_mm: float, se
         damages = find_damages(cloud, scan.label > 0, aligned(), nominal(), twin)
         told = np.isin(np.arange(len(cloud)), np.concatenate([damage.points for damage in damages]))
         deep_mm = blades.hollow_depth(scan.points, centres, depth_mm, width_mm)
-        deep_mm[scan.label > 0] = -truth_of.distance(scan.points[scan.label > 0])
+        broken_mm = scan.points[scan.label > 0]
+        deep_mm[scan.label > 0] = np.minimum(-truth_of.distance(broken_mm), blades.SPAN_MM - broken_mm[:, 2])
         middles = np.array([damage.centroid_mm for damage in damages])
         apart_mm = np.linalg.norm(centres[:, None] - middles, axis=2).min(axis=1)
         found.append((apart_mm < 0.5 * width_mm).mean())

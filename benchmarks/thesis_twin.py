@@ -18,6 +18,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -123,8 +124,8 @@ def main() -> None:
         case = case_of(pitch_mm, noise_mm, asked.seed)
         before_mm = nominal_error_mm(case, nominal)
         print(f"  noise {noise_mm:g}: {len(case.cloud)} scan points, nominal {before_mm:.4f} off the truth")
-        show("thesis", case, nominal, lambda *given: fit_twin_thesis(*given, settings))
-        show("product", case, nominal, lambda *given: fit_twin(*given, TwinSettings()))
+        show("thesis", case, nominal, partial(fit_twin_thesis, settings=settings))
+        show("product", case, nominal, partial(fit_twin, settings=TwinSettings()))
 
 
 if __name__ == "__main__":

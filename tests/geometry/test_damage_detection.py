@@ -44,7 +44,8 @@ def scanned(depth_mm: float, width_mm: float, seed: int) -> Case:
     for damage in damages:
         told[damage.points] = True
     deep = blades.hollow_depth(scan.points, centres, depth_mm, width_mm)
-    deep[scan.label > 0] = -truth.distance(scan.points[scan.label > 0])
+    broken = scan.points[scan.label > 0]
+    deep[scan.label > 0] = np.minimum(-truth.distance(broken), blades.SPAN_MM - broken[:, 2])
     limit = detection_limit(cloud, twin)[Zone.SURFACE]
     assert isinstance(limit, Measurand)
     return Case(damages, centres, told, deep, limit)
