@@ -229,9 +229,14 @@ def unexcused(measured: Measured) -> Measured:
 
 
 def with_volumes(damages: Sequence[Damage], repairs: RepairVolume | None) -> tuple[Damage, ...]:
-    """The damages, the volume of each taken from its patch where it has one."""
-    volumes = {patch.damage: patch.volume_mm3 for patch in repairs.patches} if repairs else {}
-    return tuple(replace(d, volume_mm3=volumes.get(i, d.volume_mm3)) for i, d in enumerate(damages))
+    """The damages, volume and lost skin of each taken from its patch where it has one."""
+    patches = {patch.damage: patch for patch in repairs.patches} if repairs else {}
+    return tuple(
+        replace(damage, volume_mm3=patches[i].volume_mm3, area_mm2=patches[i].area_mm2)
+        if i in patches
+        else damage
+        for i, damage in enumerate(damages)
+    )
 
 
 def deviations(points: Cloud, alignment: Alignment, nominal: Nominal) -> tuple[Floats, Floats]:

@@ -14,7 +14,7 @@ from geometry.datums import (
     register_six_point,
     service_motion,
 )
-from geometry.errors import CannotMeasure, CannotRegister
+from geometry.errors import CannotFitTwin, CannotMeasure, CannotRegister
 from geometry.nominal import Nominal
 from geometry.register import Alignment, register
 from geometry.thesis.fine_tuned import register_thesis
@@ -99,10 +99,14 @@ def on_datum(cloud: Cloud, airfoil: Alignment, nominal: Nominal, choice: Alignme
 
 
 def make_twin(cloud: Cloud, mask: Bools, alignment: Alignment, recipe: Recipe) -> Twin:
-    """The damage-free twin by the method of the plan."""
+    """The damage-free twin by the method of the plan; raises `CannotFitTwin` for one that did not settle."""
     if recipe.plan.algorithms.twin == "thesis":
-        return fit_twin_thesis(cloud, mask, alignment, recipe.nominal)
-    return fit_twin(cloud, mask, alignment, recipe.nominal, TwinSettings())
+        twin = fit_twin_thesis(cloud, mask, alignment, recipe.nominal)
+    else:
+        twin = fit_twin(cloud, mask, alignment, recipe.nominal, TwinSettings())
+    if not twin.converged:
+        raise CannotFitTwin("the twin did not converge")
+    return twin
 
 
 def cut_sections(cloud: Cloud, mask: Bools, alignment: Alignment, recipe: Recipe) -> tuple[Section, ...]:

@@ -8,7 +8,7 @@ import pytest
 
 from geometry.chart import SectionSettings
 from geometry.datums import ServiceMotion
-from geometry.errors import CannotRegister
+from geometry.errors import CannotFitTwin, CannotRegister
 from geometry.transforms import about_z, rigid
 from geometry.types import NotMeasured
 from station import methods
@@ -50,8 +50,10 @@ def called(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
     for name in ("register_root", "register_six_point", "register_sections"):
         monkeypatch.setattr(methods, name, verb(name, alignment(method=name)))
     monkeypatch.setattr(methods, "service_motion", verb("service_motion", MOTION))
-    for name in ("fit_twin", "fit_twin_thesis", "measure_sections", "measure_sections_thesis"):
-        monkeypatch.setattr(methods, name, verb(name, name))
+    for name in ("fit_twin", "fit_twin_thesis"):
+        monkeypatch.setattr(methods, name, verb(name, SimpleNamespace(converged=True)))
+    for name in ("measure_sections", "measure_sections_thesis"):
+        monkeypatch.setattr(methods, name, verb(name, ()))
     return calls
 
 
@@ -112,6 +114,14 @@ def test_each_method_can_be_the_thesis_own(
     make_twin(CLOUD, mask, found, wanted)
     cut_sections(CLOUD, mask, found, wanted)
     assert [name for name, _ in called] == verbs
+
+
+@pytest.mark.parametrize("method", ["default", "thesis"])
+def test_a_twin_that_did_not_settle_is_none(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
+    for name in ("fit_twin", "fit_twin_thesis"):
+        monkeypatch.setattr(methods, name, lambda *_: SimpleNamespace(converged=False))
+    with pytest.raises(CannotFitTwin, match="did not converge"):
+        make_twin(CLOUD, np.zeros(3, bool), alignment(), recipe(algorithms={"twin": method}))
 
 
 @pytest.mark.usefixtures("called")
