@@ -47,6 +47,7 @@ bench-sections: setup  ## sections alone: the thesis' grid by both methods, sigm
 
 bench-twin: setup  ## twin and repair alone: section 5.5, six kinds of wear, volumes, peers
 	$(BIN)/python -m benchmarks.twin
+	$(BIN)/python -m benchmarks.damage
 	$(BIN)/python -m benchmarks.repair
 
 campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenario, all seeds of the twin
