@@ -23,7 +23,7 @@ from geometry.profile import (
     reconstruct,
     whole_gap,
 )
-from geometry.register import Alignment
+from geometry.register import Alignment, pose_covariance
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured
 
@@ -232,12 +232,6 @@ def _distance_sigma(estimates: Mapping[str, Estimate], covariance: Floats) -> fl
     worst = float(np.linalg.eigvalsh(covariance)[-1])
     along = float(shift @ covariance @ shift)
     return float(np.sqrt((along + worst**2) / (float(shift @ shift) + worst)))
-
-
-def pose_covariance(alignment: Alignment) -> Floats:
-    """Covariance (6, 6) of the pose twist; where the surface leaves it free, 1 mm or 0.02 rad."""
-    prior = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0]) ** -2.0
-    return np.linalg.inv(alignment.information + np.diag(prior)).astype(np.float64)
 
 
 def _lost(profile: Profile, definition: Definition) -> Mapping[str, NotMeasured]:

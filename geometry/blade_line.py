@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from geometry.airfoil import Section, Stacking, pose_covariance
+from geometry.airfoil import Section, Stacking
 from geometry.errors import BadInput
-from geometry.register import Alignment
+from geometry.register import Alignment, pose_covariance
 from geometry.types import Floats, Measurand, Measured, NotMeasured, Unit
 
 

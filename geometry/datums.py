@@ -10,7 +10,7 @@ from geometry.errors import BadInput, CannotRegister
 from geometry.fit import Fit, every, felt, fit_kept, fit_robust, information, motions, tukey, unit_twist
 from geometry.mask import robust_sigma
 from geometry.nominal import Closest, Nominal
-from geometry.register import Alignment, RegisterSettings, mask_damage
+from geometry.register import Alignment, RegisterSettings, mask_damage, pose_covariance
 from geometry.transforms import apply, exp, inverse, log
 from geometry.types import Bools, Cloud, Floats, Measurand, Unit
 from geometry.uncertainty import certainty, form_covariance
@@ -311,7 +311,7 @@ def service_motion(root: Alignment, airfoil: Alignment, nominal: Nominal) -> Ser
     """
     moved = root.T_nominal_scan @ inverse(airfoil.T_nominal_scan)
     twist = log(moved, nominal.pivot_mm)
-    covariance = _pose_covariance(root) + _pose_covariance(airfoil)
+    covariance = sum(pose_covariance(each) + each.form_covariance for each in (root, airfoil))
     turns = np.rad2deg(np.sqrt(np.diag(covariance)[:3]))
     tip_mm = 0.5 * (nominal.le_line_mm[-1] + nominal.te_line_mm[-1])
     shift_mm = apply(moved, tip_mm[None])[0] - tip_mm
@@ -329,10 +329,3 @@ def _measurands(names: Sequence[str], values: Floats, sigmas: Floats, unit: Unit
         name: Measurand(name=name, value=float(value), sigma=float(sigma), unit=unit)
         for name, value, sigma in zip(names, values, sigmas, strict=True)
     }
-
-
-def _pose_covariance(alignment: Alignment) -> Floats:
-    """Covariance (6, 6) of the pose twist, noise and form; where it is free, of 1 mm or 0.02 rad."""
-    prior = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0]) ** -2.0
-    noise = np.linalg.inv(alignment.information + np.diag(prior))
-    return np.asarray(noise + alignment.form_covariance)

@@ -209,3 +209,9 @@ def mask_damage(
     found = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
     neighbours, _ = k_nearest(cloud.points_mm, min(settings.mask.neighbours + 1, len(cloud)))
     return _damage_of(cloud, found, neighbours, nominal, settings)
+
+
+def pose_covariance(alignment: Alignment) -> Floats:
+    """Covariance (6, 6) of the pose twist from noise; where the surface leaves it free, 1 mm or 0.02 rad."""
+    prior = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0]) ** -2.0
+    return np.linalg.inv(alignment.information + np.diag(prior)).astype(np.float64)

@@ -61,7 +61,7 @@ def render(result: Mapping[str, Any], measurement: Measurement, verdict: Verdict
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(fixed=fixed, words=words, percent=percent, bar=bar, title=title)
+    environment.filters.update(fixed=fixed, words=words, percent=percent, bar=bar, title=title, sign=sign)
     return environment.get_template("report.html.j2").render(
         result=result,
         sentence=SENTENCES[verdict.verdict.value],
@@ -154,6 +154,11 @@ def percent(value: float) -> str:
 def words(name: str) -> str:
     """`max_thickness_mm` as `max thickness`."""
     return spelled(name)[0]
+
+
+def sign(unit: str) -> str:
+    """A unit behind the name of a characteristic; nothing for a pure number."""
+    return {"deg": " °", "1": "", "fraction": ""}.get(unit, f" {unit}")
 
 
 def title(characteristic: str) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from geometry.airfoil import Section, SectionStatus, pose_covariance
+from geometry.airfoil import Section, SectionStatus
 from geometry.chart import NODES, Chart, SectionSettings, find_motion, outward_normals, unroll
 from geometry.curve import Estimate, node_shares
 from geometry.errors import CannotMeasure
@@ -17,7 +17,7 @@ from geometry.form import share_beyond_sigma
 from geometry.measurands import Definition, define, form, place, shape
 from geometry.nominal import Nominal
 from geometry.profile import Gap, Scan, explain_gaps, find_gaps
-from geometry.register import Alignment
+from geometry.register import Alignment, pose_covariance
 from geometry.thesis.rwlls_profile import ClosedProfile, RwllsSettings, reconstruct_thesis
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured
