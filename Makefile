@@ -23,8 +23,9 @@ setup: .venv/.ready  ## virtual environment with the locked packages and the bla
 demo: setup  ## simulated cell + station: inspect blades, show verdicts (DEMO=headless: no screen)
 	$(BIN)/bladecell demo $(DEMO_FLAGS)
 
+# One thread for linear algebra: threads that wait for each other by spinning make a busy machine crawl.
 test: setup lint  ## every check that .ci/run runs
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest
 
 lint: setup  ## style, types, direction of imports
 	$(BIN)/ruff check .
