@@ -11,7 +11,7 @@ import typer
 
 EXIT = {"PASS": 0, "REPAIR": 10, "SCRAP": 20, "HOLD": 30}
 BAD_INPUT = 2
-STEPS = 11  # of an inspection, for the bar
+STEPS = 14  # of an inspection, for the bar
 
 app = typer.Typer(
     name="bladecell",

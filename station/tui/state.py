@@ -32,7 +32,7 @@ from station.events import (
 
 Points = NDArray[np.float32]
 
-STEPS = ("scan", "clean", "register", "sections", "twin", "damage", "repair", "judge", "record")
+STEPS = ("scan", "clean", "register", "twin", "damage", "repair", "sections", "judge", "record")
 MAX_RECORDS = 200
 MAX_LOG_LINES = 200
 

@@ -22,10 +22,10 @@ STEP_TEXT = {
     "scan": "Scan",
     "clean": "Clean and fuse",
     "register": "Register to nominal",
-    "sections": "Sections",
     "twin": "Damage-free twin",
     "damage": "Damages",
     "repair": "Repair volume",
+    "sections": "Sections",
     "judge": "Verdict",
     "record": "Record",
 }
