@@ -37,32 +37,19 @@ from geometry.errors import GeometryError
 from geometry.measurands import define, form, place, shape
 from geometry.nominal import NominalSection
 from geometry.profile import Scan, reconstruct
-from geometry.register import Alignment
 from geometry.types import Floats, Measurand
 from tests.geometry.airfoils import (
     AnalyticNominal,
     Blade,
     DiscAirfoil,
     Part,
+    alignment,
     cloud_of,
     random_airfoil,
     section_of,
 )
 
-PERFECT = Alignment(
-    method="airfoil",
-    T_nominal_scan=np.eye(4),
-    pivot_mm=np.array([0.0, 0.0, 52.5]),
-    information=np.eye(6) * 1e12,
-    weak_directions=(),
-    rms_mm=0.01,
-    noise_mm=0.01,
-    inlier_fraction=1.0,
-    explained_fraction=1.0,
-    runner_up_ratio=5.0,
-    iterations=1,
-    converged=True,
-)
+PERFECT = alignment()
 NOISES_MM = (0.010, 0.015, 0.020, 0.025, 0.030)
 SPACINGS_MM = (0.100, 0.125, 0.150, 0.175, 0.200)
 HEIGHTS_MM = (7.0, 52.5, 98.0)

@@ -28,6 +28,7 @@ from geometry.thesis.stiff_twin import ThesisTwinSettings, fit_twin_thesis
 from geometry.twin import Twin, TwinSettings, fit_twin
 from geometry.types import Bools, Cloud, Mesh
 from tests.geometry import twin_blades as blades
+from tests.geometry.poses import in_place
 
 NOISES_MM = {False: (0.0, 0.006, 0.01), True: (0.006,)}
 SIZES = {
@@ -60,28 +61,10 @@ def case_of(pitch_mm: float, noise_mm: float, seed: int) -> Case:
     return Case(truth=truth, cuts=cuts, cloud=cloud)
 
 
-def aligned() -> Alignment:
-    """The scan is made in the nominal's frame."""
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4),
-        pivot_mm=np.zeros(3),
-        information=np.eye(6) * 1e8,
-        weak_directions=(),
-        rms_mm=0.02,
-        noise_mm=0.01,
-        inlier_fraction=0.97,
-        explained_fraction=1.0,
-        runner_up_ratio=5.0,
-        iterations=1,
-        converged=True,
-    )
-
-
 def show(label: str, case: Case, nominal: Nominal, fit: Fit) -> None:
     """One line of the table; the first line of a block is the nominal's own error."""
     start_s = time.process_time()
-    twin = fit(case.cloud, np.zeros(len(case.cloud), np.bool_), aligned(), nominal)
+    twin = fit(case.cloud, np.zeros(len(case.cloud), np.bool_), in_place(), nominal)
     cpu_s = time.process_time() - start_s
     before_mm = twin.mesh.vertices_mm - twin.displacement_mm
     side = (before_mm[:, 2] < blades.SPAN_MM - 1e-3) & (before_mm[:, 2] > nominal.z_min_mm)
@@ -114,7 +97,9 @@ def main() -> None:
     nodes, patches, pitch_mm = SIZES[asked.full]
     settings = ThesisTwinSettings(nodes=nodes, patches=patches)
     warm = case_of(0.6, 0.01, 0)  # compiles the kernels
-    fit_twin_thesis(warm.cloud, np.zeros(len(warm.cloud), np.bool_), aligned(), nominal, ThesisTwinSettings())
+    fit_twin_thesis(
+        warm.cloud, np.zeros(len(warm.cloud), np.bool_), in_place(), nominal, ThesisTwinSettings()
+    )
     print(f"twin, seed {asked.seed}, {nodes} nodes; mm")
     print(
         f"    {'':10s} {'all':>8s} {'scanned':>8s} {'lost':>8s} {'largest':>8s} {'sigmas':>7s} {'lost':>6s}"

@@ -32,6 +32,7 @@ from geometry.solid import slice_loops
 from geometry.twin import Twin, TwinSettings, fit_twin
 from geometry.types import Bools, Cloud, Floats, Mesh
 from tests.geometry import twin_blades as blades
+from tests.geometry.poses import in_place
 
 POINTS = 258_520
 PITCH_MM = 0.1865  # gives slightly more
@@ -131,24 +132,6 @@ def case(shape: blades.Shape, pitch_mm: float, noise_mm: float, seed: int, most:
     view = np.zeros(len(points_mm), np.int64)
     cloud = Cloud(points_mm=points_mm, sigma_mm=sigma_mm, view=view)
     return Case(truth=truth, cuts=cuts, cloud=cloud, broken=broken)
-
-
-def in_place() -> Alignment:
-    """The alignment of a scan that lies in the nominal frame already."""
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4),
-        pivot_mm=np.zeros(3),
-        information=np.eye(6) * 1e8,
-        weak_directions=(),
-        rms_mm=0.02,
-        noise_mm=0.01,
-        inlier_fraction=0.97,
-        explained_fraction=1.0,
-        runner_up_ratio=5.0,
-        iterations=5,
-        converged=True,
-    )
 
 
 def nominal_of(pitch_mm: float, turn: float) -> Nominal:

@@ -76,7 +76,7 @@ class _Pose:
     score_mm: float
 
 
-def _principal_frame(points_mm: Floats) -> Floats:
+def principal_frame(points_mm: Floats) -> Floats:
     """The 4x4 that carries principal coordinates (longest first) to where the points are."""
     mean_mm = points_mm.mean(axis=0)
     spread, axes = np.linalg.eigh(np.cov((points_mm - mean_mm).T))
@@ -89,15 +89,15 @@ def _principal_frame(points_mm: Floats) -> Floats:
 
 def _axis_starts(points_mm: Floats, nominal: Nominal) -> Floats:
     """Poses (s, 4, 4) that lay principal axes on principal axes: of the airfoil, and of the whole nominal."""
-    T_principal_scan = inverse(_principal_frame(points_mm))
+    T_principal_scan = inverse(principal_frame(points_mm))
     flips = [np.diag([a, b, a * b, 1.0]) for a, b in product((1.0, -1.0), repeat=2)]
-    frames = [_principal_frame(nominal.samples.points_mm), _principal_frame(nominal.shell_mm)]
+    frames = [principal_frame(nominal.samples.points_mm), principal_frame(nominal.shell_mm)]
     return np.stack([frame @ flip @ T_principal_scan for frame in frames for flip in flips])
 
 
 def _many_starts(points_mm: Floats, nominal: Nominal) -> Floats:
     """Poses (s, 4, 4): each principal axis of the scan up or down the span, rolled, and shifted along it."""
-    centred = inverse(_principal_frame(points_mm))
+    centred = inverse(principal_frame(points_mm))
     axes = [p for p in permutations(range(3)) if p in {(0, 1, 2), (1, 2, 0), (2, 0, 1)}]
     height_mm = nominal.z_max_mm - nominal.z_min_mm
     starts = []

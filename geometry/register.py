@@ -215,3 +215,10 @@ def pose_covariance(alignment: Alignment) -> Floats:
     """Covariance (6, 6) of the pose twist from noise; where the surface leaves it free, 1 mm or 0.02 rad."""
     prior = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0]) ** -2.0
     return np.linalg.inv(alignment.information + np.diag(prior)).astype(np.float64)
+
+
+def variance_along(alignment: Alignment, point_mm: Floats, normal: Floats) -> float:
+    """Variance (mm^2) from point noise of the pose at a point (3,) along a normal (3,), nominal frame."""
+    lever = np.concatenate([np.cross(point_mm - alignment.pivot_mm, normal), normal])
+    covariance = np.linalg.pinv(alignment.information, rcond=1e-14, hermitian=True)
+    return max(float(lever @ covariance @ lever), 0.0)

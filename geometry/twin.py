@@ -11,8 +11,9 @@ from geometry.kernels.graph import dilate, grow
 from geometry.nominal import Closest, Nominal
 from geometry.offset import Nodes, Offset, fit_offset, scatter_nodes
 from geometry.refine import Refined, refine
-from geometry.register import Alignment
+from geometry.register import Alignment, variance_along
 from geometry.solid import face_areas_mm2, solid_normals
+from geometry.surface import near_each_other
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh, NotMeasured
 
@@ -21,7 +22,6 @@ COARSER = 2.0  # spacing of the nodes that the free form is fitted to, in those 
 PATCH_CELLS = 0.4  # what the lattice cannot follow is alike over this part of a cell
 FIRST_STIFFNESS = 1e4  # of the free form, before the data set it
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
-SORT_CELL_MM = 2.0  # points in one such cell are handled together
 NO_NOISE_MM = 1e-5  # least scatter believed
 
 
@@ -77,7 +77,7 @@ def fit_twin(
     Raises `CannotFitTwin` when sound points do not hold enough of the airfoil.
     """
     scan_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
-    order = _near_each_other(scan_mm)  # what is asked together then lies in the cache
+    order = near_each_other(scan_mm)  # what is asked together then lies in the cache
     scan_mm, mask, point_sigma_mm = scan_mm[order], mask[order], cloud.sigma_mm[order]
     rng = np.random.default_rng(settings.seed)
     ground = _prepare(nominal, min(settings.nodes, max(len(cloud) // 4, 100)), settings)
@@ -102,12 +102,6 @@ def fit_twin(
         iterations=rounds,
         converged=converged,
     )
-
-
-def _near_each_other(points_mm: Floats) -> Ints:
-    """An order of the points in which those of one cell of a grid follow each other."""
-    cell = np.floor(points_mm / SORT_CELL_MM).astype(np.int64)
-    return np.asarray(np.lexsort(cell.T))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -390,13 +384,11 @@ def _form(surface: _Surface, nodes: Nodes, alignment: Alignment) -> Measured:
     if not surface.held.any():
         return NotMeasured(reason="no sound surface")
     worst = int(np.argmax(np.where(surface.held, np.abs(surface.moved_mm), -1.0)))
-    arm_mm, normal = nodes.points_mm[worst] - alignment.pivot_mm, nodes.normals[worst]
-    lever = np.concatenate([np.cross(arm_mm, normal), normal])
-    pose_mm2 = float(lever @ np.linalg.pinv(alignment.information, rcond=1e-14, hermitian=True) @ lever)
+    pose_mm2 = variance_along(alignment, nodes.points_mm[worst], nodes.normals[worst])
     return Measurand(
         name="form_deviation",
         value=float(np.abs(surface.moved_mm[worst])),
-        sigma=float(np.sqrt(surface.sigma_mm[worst] ** 2 + max(pose_mm2, 0.0))),
+        sigma=float(np.sqrt(surface.sigma_mm[worst] ** 2 + pose_mm2)),
         unit="mm",
     )
 

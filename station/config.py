@@ -8,11 +8,10 @@ from typing import Annotated, Literal, Self
 from platformdirs import user_config_path
 from pydantic import AwareDatetime, Field, PrivateAttr, StringConstraints, model_validator
 
-from station.tomlfile import BadFile, Number, Port, Positive, Settings, Text, read_settings
+from station.tomlfile import BadFile, NonNegative, Port, Positive, Row, Settings, Text, read_settings
 
 Mode = Literal["PRODUCTION", "STUDY", "MAINTENANCE", "SIMULATION"]
 RecipeNumber = Annotated[str, StringConstraints(pattern=r"^[1-9][0-9]{0,4}$")]
-Row = tuple[Number, Number, Number, Number]
 
 DEFAULT_PLACES = (Path("config/station.toml"), user_config_path("bladecell") / "station.toml")
 
@@ -26,7 +25,7 @@ class Turntable(Settings):
     baud: Annotated[int, Field(gt=0)] = 115200
     address: Annotated[int, Field(ge=1, le=99)] = 1
     reply_timeout_s: Positive = 0.5
-    settle_s: Annotated[Number, Field(ge=0.0)] = 0.05
+    settle_s: NonNegative = 0.05
     position_tolerance_deg: Positive = 0.01
 
 
@@ -154,8 +153,8 @@ class Calibration(Settings):
     schema_: Annotated[Literal["bladecell.calibration/1"], Field(alias="schema")]
     created_utc: AwareDatetime
     T_scanner_table0: tuple[Row, Row, Row, Row]
-    sigma_axis_offset_mm: Annotated[Number, Field(ge=0.0)]
-    sigma_axis_tilt_deg: Annotated[Number, Field(ge=0.0)]
+    sigma_axis_offset_mm: NonNegative
+    sigma_axis_tilt_deg: NonNegative
     scanner_serial: int
 
     def age_days(self, now: datetime) -> float:

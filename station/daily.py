@@ -7,9 +7,7 @@ from pydantic import AwareDatetime, Field
 
 from station.config import BadConfig, StationConfig
 from station.gates import Gate
-from station.tomlfile import Number, Settings, read_settings
-
-NonNegative = Annotated[Number, Field(ge=0.0)]
+from station.tomlfile import NonNegative, Number, Settings, read_settings
 
 
 class DailyCheck(Settings):

@@ -54,7 +54,9 @@ def align(cloud: Cloud, recipe: Recipe) -> Aligned:
     if choice.datum_z_mm is None:
         return Aligned(alignment=alignment, service=None)
     try:
-        service = in_service(cloud, airfoil, nominal, choice.datum_z_mm)
+        rooted = choice.method == "root"
+        root = alignment if rooted else register_root(cloud, nominal, airfoil, choice.datum_z_mm)
+        service = in_service(root, airfoil, nominal)
     except CannotMeasure as why:
         service = NotMeasured(reason=str(why))
     return Aligned(alignment=alignment, service=service)
@@ -74,11 +76,8 @@ def agreeing(thesis: Alignment, default: Alignment, nominal: Nominal) -> Alignme
     return thesis
 
 
-def in_service(
-    cloud: Cloud, airfoil: Alignment, nominal: Nominal, datum_z_mm: tuple[float, float]
-) -> ServiceMotion | NotMeasured:
+def in_service(root: Alignment, airfoil: Alignment, nominal: Nominal) -> ServiceMotion | NotMeasured:
     """How the airfoil stands against its root; only where the root zone tells a whole pose."""
-    root = register_root(cloud, nominal, airfoil, datum_z_mm)
     if root.weak_directions or not root.converged:
         return NotMeasured(reason="the datum zone leaves a direction free")
     return service_motion(root, airfoil, nominal)

@@ -20,7 +20,7 @@ from pydantic import (
 from geometry.errors import BadInput
 from geometry.transforms import check_rigid
 from geometry.types import Zone
-from station.tomlfile import BadFile, Number, Positive, Settings, Text, read_settings
+from station.tomlfile import BadFile, NonNegative, Number, Positive, Row, Settings, Text, read_settings
 
 SPAN_TOLERANCE_MM = 0.01  # a nominal in float32 does not end exactly where the plan says
 
@@ -65,7 +65,6 @@ def section_key(name: str) -> str:
     return name
 
 
-Row = tuple[Number, Number, Number, Number]
 DamageZone = Literal["tip", "leading_edge", "trailing_edge", "surface"]
 
 
@@ -151,10 +150,10 @@ class Algorithms(Settings):
 class SectionFit(Settings):
     """How the sections are best fitted for `fit_*` and `profile_form_mm`: weights of the sides, and locks."""
 
-    le: Annotated[Number, Field(ge=0.0)] = 1.0
-    suction: Annotated[Number, Field(ge=0.0)] = 1.0
-    te: Annotated[Number, Field(ge=0.0)] = 1.0
-    pressure: Annotated[Number, Field(ge=0.0)] = 1.0
+    le: NonNegative = 1.0
+    suction: NonNegative = 1.0
+    te: NonNegative = 1.0
+    pressure: NonNegative = 1.0
     locked: tuple[Literal["x", "y", "rotation"], ...] = ()
 
     @model_validator(mode="after")
@@ -278,7 +277,7 @@ class Limits(Settings):
 class Repair(Settings):
     """`frames`: where the patches are wanted beside the nominal's own frame, each as a file of its own."""
 
-    allowance_mm: Annotated[Number, Field(ge=0.0)] = 0.0
+    allowance_mm: NonNegative = 0.0
     frames: tuple[Literal["scan", "fixture"], ...] = ()
     T_fixture_scan: tuple[Row, Row, Row, Row] | None = None
 

@@ -21,6 +21,8 @@ def printable(text: str) -> str:
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
+NonNegative = Annotated[Number, Field(ge=0.0)]
+Row = tuple[Number, Number, Number, Number]  # of a 4x4 motion
 Text = Annotated[str, Strict(), Field(min_length=1, max_length=200), AfterValidator(printable)]
 Port = Annotated[int, Strict(), Field(ge=1, le=65535)]
 

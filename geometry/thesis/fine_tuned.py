@@ -11,20 +11,20 @@ from itertools import product
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geometry.coarse import principal_frame
 from geometry.errors import BadInput, CannotRegister
 from geometry.fit import every, felt, information, solve_step
 from geometry.kernels.hausdorff import average_hausdorff
 from geometry.mask import robust_sigma
 from geometry.nominal import Nominal
 from geometry.register import Alignment
-from geometry.surface import local_shape
+from geometry.surface import local_shape, near_each_other
 from geometry.thesis.cad_points import pitch_of, sample_cad
 from geometry.transforms import apply, inverse, rigid
 from geometry.types import Bools, Cloud, Floats, Ints
 
 TRIAL_POINTS = 1500  # of the scan, to choose among the signs of the principal axes
 TRIAL_STEPS = 30
-CELL_MM = 2.0  # points are asked for cell by cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,10 +80,8 @@ def mask_thesis(cloud: Cloud, alignment: Alignment, nominal: Nominal) -> Bools:
 
 
 def _thinned(cloud: Cloud, most: int) -> Cloud:
-    """At most so many points, cell by cell: a tree that is asked in this order answers twice as fast."""
     kept = every(len(cloud), most)
-    cell = np.floor(cloud.points_mm[kept] / CELL_MM).astype(np.int64)
-    kept = kept[np.lexsort(cell.T)]
+    kept = kept[near_each_other(cloud.points_mm[kept])]
     return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
 
 
@@ -120,24 +118,13 @@ def _from_principal_axes(scan_mm: Floats, cad_mm: Floats, tree: cKDTree) -> tupl
 
     Scores are mean distances after a short ICP of few points from each choice of signs.
     """
-    T_principal_scan, T_nominal_principal = inverse(_principal_frame(scan_mm)), _principal_frame(cad_mm)
+    T_principal_scan, T_nominal_principal = inverse(principal_frame(scan_mm)), principal_frame(cad_mm)
     flips = [np.diag([a, b, a * b, 1.0]) for a, b in product((1.0, -1.0), repeat=2)]
     starts = [T_nominal_principal @ flip @ T_principal_scan for flip in flips]
     few_mm = scan_mm[every(len(scan_mm), TRIAL_POINTS)]
     trials = [_short_icp(few_mm, cad_mm, tree, T) for T in starts]
     (best_mm, T_best), (second_mm, _), *_ = sorted(trials, key=lambda trial: trial[0])
     return T_best, second_mm / max(best_mm, 1e-9)
-
-
-def _principal_frame(points_mm: Floats) -> Floats:
-    """The 4x4 that carries principal coordinates (longest first) to where the points are."""
-    mean_mm = points_mm.mean(axis=0)
-    spread, axes = np.linalg.eigh(np.cov((points_mm - mean_mm).T))
-    if not spread[1] > 1e-6 * spread[2]:
-        raise CannotRegister(f"{len(points_mm)} points lie on a line")
-    axes = axes[:, ::-1]
-    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
-    return rigid(axes, mean_mm)
 
 
 def _short_icp(points_mm: Floats, cad_mm: Floats, tree: cKDTree, T: Floats) -> tuple[float, Floats]:

@@ -19,7 +19,7 @@ from geometry.mask import robust_sigma
 from geometry.nominal import Nominal
 from geometry.offset import Nodes
 from geometry.refine import Refined, refine
-from geometry.register import Alignment
+from geometry.register import Alignment, variance_along
 from geometry.solid import solid_normals
 from geometry.thesis.cad_points import pitch_of, sample_cad
 from geometry.thesis.medial_axis import medial_sheet
@@ -392,12 +392,10 @@ def _form(
         return NotMeasured(reason="no sound surface")
     along_mm = np.einsum("nj,nj->n", matched.moved_mm - nodes.points_mm, nodes.normals)
     worst = int(np.argmax(np.where(inner, np.abs(along_mm), -1.0)))
-    arm_mm, normal = nodes.points_mm[worst] - alignment.pivot_mm, nodes.normals[worst]
-    lever = np.concatenate([np.cross(arm_mm, normal), normal])
-    pose_mm2 = float(lever @ np.linalg.pinv(alignment.information, rcond=1e-14, hermitian=True) @ lever)
+    pose_mm2 = variance_along(alignment, nodes.points_mm[worst], nodes.normals[worst])
     return Measurand(
         name="form_deviation",
         value=float(np.abs(along_mm[worst])),
-        sigma=float(np.sqrt(seen_sigma_mm**2 + max(pose_mm2, 0.0))),
+        sigma=float(np.sqrt(seen_sigma_mm**2 + pose_mm2)),
         unit="mm",
     )

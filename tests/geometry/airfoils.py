@@ -12,7 +12,9 @@ from functools import cache
 import numpy as np
 
 from geometry.nominal import Nominal, NominalSection
+from geometry.register import Alignment
 from geometry.types import Cloud, Floats, Ints
+from tests.geometry.poses import in_place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,6 +222,13 @@ class AnalyticNominal(Nominal):
         if z_mm not in self._sections:
             self._sections[z_mm] = section_of(*self.blade.section(z_mm), z_mm)
         return self._sections[z_mm]
+
+
+def alignment(
+    information: Floats | None = None, T: Floats | None = None, pivot_z_mm: float = 52.5
+) -> Alignment:
+    """A scan in place about the middle of a blade, without any doubt of its pose unless told."""
+    return in_place(T, pivot_z_mm, np.eye(6) * 1e12 if information is None else information)
 
 
 def cloud_of(points_mm: Floats, sigma_mm: float) -> Cloud:

@@ -17,6 +17,7 @@ from geometry.damage import Damage, DamageKind
 from geometry.register import Alignment
 from geometry.twin import Twin
 from geometry.types import Cloud, Measurand, Mesh, NotMeasured, Zone
+from tests.geometry.poses import in_place
 
 Array = NDArray[np.float64]
 
@@ -217,24 +218,6 @@ class Specimen:
     on_break: NDArray[np.int64]  # (points,) number of the damage that the point lies on, -1 none
 
 
-def still() -> Alignment:
-    """The alignment of a scan that is already in the nominal frame."""
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4),
-        pivot_mm=np.zeros(3),
-        information=np.eye(6) * 1e8,
-        weak_directions=(),
-        rms_mm=0.01,
-        noise_mm=0.01,
-        inlier_fraction=0.98,
-        explained_fraction=0.98,
-        runner_up_ratio=4.0,
-        iterations=10,
-        converged=True,
-    )
-
-
 def twin_of(mesh: Mesh, sound: NDArray[np.bool_], noise_mm: float, sigma_mm: float = 0.002) -> Twin:
     count = len(mesh.vertices_mm)
     return Twin(
@@ -285,7 +268,7 @@ def specimen(
     return Specimen(
         twin=twin_of(mesh, on_break < 0, noise_mm),
         cloud=cloud,
-        alignment=still(),
+        alignment=in_place(),
         damages=damages,
         removed_mm3=tuple(removed),
         damaged=damaged,

@@ -14,32 +14,14 @@ from geometry.airfoil import (
 )
 from geometry.chart import SectionSettings, outward_normals, unroll
 from geometry.measurands import define, form, place, shape
-from geometry.register import Alignment
 from geometry.transforms import exp
 from geometry.types import Cloud, Measurand, NotMeasured
-from tests.geometry.airfoils import AnalyticNominal, Blade, Part, cloud_of, section_of
+from tests.geometry.airfoils import AnalyticNominal, Blade, Part, alignment, cloud_of, section_of
 
 Z = 52.5
 NOMINAL = AnalyticNominal(Blade())
 SETTINGS = SectionSettings()
 CHART = unroll(NOMINAL, Z, 6.0, SETTINGS)
-
-
-def alignment(information=None, T=None):
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4) if T is None else T,
-        pivot_mm=np.array([0.0, 0.0, 52.5]),
-        information=np.eye(6) * 1e12 if information is None else information,
-        weak_directions=(),
-        rms_mm=0.01,
-        noise_mm=0.01,
-        inlier_fraction=1.0,
-        explained_fraction=1.0,
-        runner_up_ratio=5.0,
-        iterations=1,
-        converged=True,
-    )
 
 
 def measure(points, mask=None, pose=None, z=Z, settings=SETTINGS):

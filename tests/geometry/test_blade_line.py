@@ -8,27 +8,14 @@ import pytest
 from geometry.airfoil import Section, SectionStatus, Stacking
 from geometry.blade_line import blade_line
 from geometry.errors import BadInput
-from geometry.register import Alignment
 from geometry.types import Measurand, NotMeasured
+from tests.geometry import airfoils
 
 HEIGHTS = (10.0, 40.0, 60.0, 90.0)
 
 
 def alignment(information=None):
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4),
-        pivot_mm=np.array([0.0, 0.0, 50.0]),
-        information=np.eye(6) * 1e12 if information is None else information,
-        weak_directions=(),
-        rms_mm=0.01,
-        noise_mm=0.01,
-        inlier_fraction=1.0,
-        explained_fraction=1.0,
-        runner_up_ratio=5.0,
-        iterations=1,
-        converged=True,
-    )
+    return airfoils.alignment(information, pivot_z_mm=50.0)
 
 
 def section(z, measured, nominal=(0.0, 0.0, 0.0), sd=(0.001, 0.001, 1e-5)):

@@ -10,37 +10,15 @@ import pytest
 
 from geometry.errors import CannotFitTwin
 from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
-from geometry.register import Alignment
 from geometry.solid import check_solid
 from geometry.transforms import apply, exp, inverse
 from geometry.twin import Twin, TwinSettings, fit_twin
-from geometry.types import Bools, Cloud, Floats, Measurand, Mesh
+from geometry.types import Bools, Floats, Measurand, Mesh
 from tests.geometry import twin_blades as blades
+from tests.geometry.airfoils import cloud_of
+from tests.geometry.poses import in_place
 
 TURBINE = Path(__file__).parents[3] / "shared/data/turbineblade/turbineblade.ply"
-
-
-def cloud_of(points: Floats, sigma_mm: float) -> Cloud:
-    return Cloud(
-        points_mm=points, sigma_mm=np.full(len(points), sigma_mm), view=np.zeros(len(points), np.int64)
-    )
-
-
-def aligned(T: Floats | None = None) -> Alignment:
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4) if T is None else T,
-        pivot_mm=np.zeros(3),
-        information=np.eye(6) * 1e8,
-        weak_directions=(),
-        rms_mm=0.02,
-        noise_mm=0.01,
-        inlier_fraction=0.97,
-        explained_fraction=1.0,
-        runner_up_ratio=5.0,
-        iterations=5,
-        converged=True,
-    )
 
 
 @cache
@@ -74,7 +52,7 @@ def fitted(shape: str, noise_mm: float, unstructured: bool = False) -> Case:
     twin = fit_twin(
         cloud_of(scan.points, max(noise_mm, 0.001)),
         scan.label > 0,
-        aligned(),
+        in_place(),
         nominal(unstructured),
         TwinSettings(),
     )
@@ -162,7 +140,7 @@ def test_the_frame_of_the_scan_does_not_matter() -> None:
     case = fitted("service", 0.01)
     T = exp(np.array([0.4, -1.1, 2.0, 30.0, -80.0, 12.0]), np.zeros(3))
     moved = cloud_of(apply(inverse(T), case.scan.points), 0.01)
-    twin = fit_twin(moved, case.scan.label > 0, aligned(T), nominal(), TwinSettings())
+    twin = fit_twin(moved, case.scan.label > 0, in_place(T), nominal(), TwinSettings())
     np.testing.assert_allclose(twin.mesh.vertices_mm, case.twin.mesh.vertices_mm, atol=5e-4)
 
 
@@ -170,13 +148,13 @@ def test_without_enough_sound_points_there_is_no_twin() -> None:
     case = fitted("service", 0.01)
     cloud = cloud_of(case.scan.points, 0.01)
     with pytest.raises(CannotFitTwin):
-        fit_twin(cloud, np.ones(len(cloud), np.bool_), aligned(), nominal(), TwinSettings())
+        fit_twin(cloud, np.ones(len(cloud), np.bool_), in_place(), nominal(), TwinSettings())
     low = case.scan.points[case.scan.points[:, 2] < 20.0]
     with pytest.raises(CannotFitTwin):
-        fit_twin(cloud_of(low, 0.01), np.zeros(len(low), np.bool_), aligned(), nominal(), TwinSettings())
+        fit_twin(cloud_of(low, 0.01), np.zeros(len(low), np.bool_), in_place(), nominal(), TwinSettings())
     few = cloud_of(case.scan.points[:3], 0.01)
     with pytest.raises(CannotFitTwin):
-        fit_twin(few, np.zeros(3, np.bool_), aligned(), nominal(), TwinSettings())
+        fit_twin(few, np.zeros(3, np.bool_), in_place(), nominal(), TwinSettings())
 
 
 @pytest.mark.skipif(not TURBINE.is_file(), reason="the real turbine blade is not here")
@@ -201,7 +179,7 @@ def test_a_real_blade_with_platform_and_root() -> None:
     twin = fit_twin(
         cloud_of(points, 0.005),
         np.zeros(len(points), np.bool_),
-        aligned(),
+        in_place(),
         given,
         replace(TwinSettings(), draws=16),
     )

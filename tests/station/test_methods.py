@@ -80,6 +80,12 @@ def test_a_datum_zone_tells_bend_and_twist_beside_any_method(called: list[tuple[
     assert align(CLOUD, recipe()).service is None
 
 
+def test_the_root_is_fitted_once(called: list[tuple[str, Any]]) -> None:
+    found = align(CLOUD, recipe(alignment={"method": "root", "datum_z_mm": [0.0, 20.0]}))
+    assert found.service is MOTION
+    assert [name for name, _ in called] == ["register", "register_root", "service_motion"]
+
+
 @pytest.mark.usefixtures("called")
 @pytest.mark.parametrize("weak", [((0.0,) * 6,), None])
 def test_a_root_zone_that_is_not_enough_costs_its_numbers_only(

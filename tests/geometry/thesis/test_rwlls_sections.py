@@ -8,11 +8,10 @@ import pytest
 from geometry.airfoil import SectionStatus, with_damages
 from geometry.chart import SectionSettings, unroll
 from geometry.measurands import define, form, place, shape
-from geometry.register import Alignment
 from geometry.thesis.rwlls_sections import ThesisSectionSettings, measure_sections_thesis
 from geometry.transforms import exp
 from geometry.types import Measurand, NotMeasured
-from tests.geometry.airfoils import AnalyticNominal, Blade, Part, cloud_of, section_of
+from tests.geometry.airfoils import AnalyticNominal, Blade, Part, alignment, cloud_of, section_of
 
 Z = 52.5
 NOISE_MM, SPACING_MM = 0.015, 0.12
@@ -21,23 +20,6 @@ PART = Part(
     deviation=lambda s, z: 0.01 * np.sin(2 * np.pi * 6 * s + 0.02 * z), shift_mm=(0.05, -0.03), turn_deg=0.2
 )
 CHART = unroll(NOMINAL, Z, 1.0, SectionSettings())
-
-
-def alignment(information=None, T=None):
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4) if T is None else T,
-        pivot_mm=np.array([0.0, 0.0, 52.5]),
-        information=np.eye(6) * 1e12 if information is None else information,
-        weak_directions=(),
-        rms_mm=0.01,
-        noise_mm=0.01,
-        inlier_fraction=1.0,
-        explained_fraction=1.0,
-        runner_up_ratio=5.0,
-        iterations=1,
-        converged=True,
-    )
 
 
 def scan(seed):

@@ -12,7 +12,6 @@ from geometry.kernels.stiff_quadric import feet_on_quadrics, fit_quadrics
 from geometry.kernels.stiff_sheet import crosses_sheet
 from geometry.kernels.stiff_system import apply_system, relax
 from geometry.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.register import Alignment
 from geometry.solid import check_solid
 from geometry.surface import local_shape
 from geometry.thesis.medial_axis import medial_sheet
@@ -20,34 +19,13 @@ from geometry.thesis.region_growing import RegionGrowingSettings, geometric_erro
 from geometry.thesis.stiff_twin import ThesisTwinSettings, fit_twin_thesis
 from geometry.thesis.stiffness import factor_patches, prepare_stiffness, solve_stiff
 from geometry.twin import Twin
-from geometry.types import Bools, Cloud, Floats, Measurand, Mesh
+from geometry.types import Bools, Floats, Measurand, Mesh
 from tests.geometry import twin_blades as blades
+from tests.geometry.airfoils import cloud_of
+from tests.geometry.poses import in_place
 
 FEW = ThesisTwinSettings(nodes=8000, patches=400)
 PITCH_MM = 0.4
-
-
-def cloud_of(points: Floats, sigma_mm: float) -> Cloud:
-    return Cloud(
-        points_mm=points, sigma_mm=np.full(len(points), sigma_mm), view=np.zeros(len(points), np.int64)
-    )
-
-
-def aligned() -> Alignment:
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=np.eye(4),
-        pivot_mm=np.zeros(3),
-        information=np.eye(6) * 1e8,
-        weak_directions=(),
-        rms_mm=0.02,
-        noise_mm=0.01,
-        inlier_fraction=0.97,
-        explained_fraction=1.0,
-        runner_up_ratio=5.0,
-        iterations=5,
-        converged=True,
-    )
 
 
 @cache
@@ -78,7 +56,7 @@ class Case:
 def fitted(noise_mm: float) -> Case:
     scan, cuts, truth = service_scan(noise_mm)
     cloud = cloud_of(scan.points, max(noise_mm, 0.001))
-    twin = fit_twin_thesis(cloud, np.zeros(len(cloud), np.bool_), aligned(), nominal(), FEW)
+    twin = fit_twin_thesis(cloud, np.zeros(len(cloud), np.bool_), in_place(), nominal(), FEW)
     before = twin.mesh.vertices_mm - twin.displacement_mm
     side = (before[:, 2] < blades.SPAN_MM - 1e-3) & (before[:, 2] > 2.0)
     return Case(
@@ -120,10 +98,10 @@ def test_without_enough_sound_points_there_is_no_twin() -> None:
     scan, _, _ = service_scan(0.01)
     cloud = cloud_of(scan.points, 0.01)
     with pytest.raises(CannotFitTwin):
-        fit_twin_thesis(cloud, np.ones(len(cloud), np.bool_), aligned(), nominal(), FEW)
+        fit_twin_thesis(cloud, np.ones(len(cloud), np.bool_), in_place(), nominal(), FEW)
     low = scan.points[scan.points[:, 2] < 15.0]
     with pytest.raises(CannotFitTwin):
-        fit_twin_thesis(cloud_of(low, 0.01), np.zeros(len(low), np.bool_), aligned(), nominal(), FEW)
+        fit_twin_thesis(cloud_of(low, 0.01), np.zeros(len(low), np.bool_), in_place(), nominal(), FEW)
 
 
 @pytest.mark.parametrize("wrong", [{"nodes": 3}, {"relaxation": 1.0}, {"settled": 0.0}])
