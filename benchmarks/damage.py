@@ -16,9 +16,11 @@ from geometry.damage import HOLLOW_SPACINGS, detection_limit, find_damages
 from geometry.twin import TwinSettings, fit_twin
 from geometry.types import Measurand, Zone
 from tests.geometry import twin_blades as blades
+from tests.geometry.airfoils import cloud_of
+from tests.geometry.poses import in_place
 from tests.geometry.test_damage_depth import CUTTERS, DENSITIES, NOISE_MM, number, one, truth
 from tests.geometry.test_damage_detection import centres_of
-from tests.geometry.test_twin import aligned, cloud_of, nominal
+from tests.geometry.test_twin import nominal
 
 HOLLOWS = (  # depth in detection limits, width in spacings, pitch, noise
     (1.0, HOLLOW_SPACINGS, 0.4, 0.01),
@@ -51,13 +53,13 @@ def hollows(limits: float, spacings: float, pitch_mm: float, noise_mm: float, se
         shape = blades.hollowed(whole, centres, depth_mm, width_mm)
         scan = blades.scan(truth_of, cuts, pitch_mm=pitch_mm, noise_mm=noise_mm, scanned=shape, seed=seed)
         cloud = cloud_of(scan.points, noise_mm)
-        twin = fit_twin(cloud, scan.label > 0, aligned(), nominal(), TwinSettings())
+        twin = fit_twin(cloud, scan.label > 0, in_place(), nominal(), TwinSettings())
         if not seed:
             limit = detection_limit(cloud, twin)[Zone.SURFACE]
             assert isinstance(limit, Measurand)
             depth_mm = limits * limit.value
             continue
-        damages = find_damages(cloud, scan.label > 0, aligned(), nominal(), twin)
+        damages = find_damages(cloud, scan.label > 0, in_place(), nominal(), twin)
         told = np.isin(np.arange(len(cloud)), np.concatenate([damage.points for damage in damages]))
         deep_mm = blades.hollow_depth(scan.points, centres, depth_mm, width_mm)
         broken_mm = scan.points[scan.label > 0]

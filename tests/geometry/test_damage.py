@@ -8,7 +8,9 @@ from geometry.damage import Damage, DamageKind, detection_limit, find_damages
 from geometry.twin import TwinSettings, fit_twin
 from geometry.types import Bools, Measurand, Zone
 from tests.geometry import twin_blades as blades
-from tests.geometry.test_twin import aligned, cloud_of, nominal
+from tests.geometry.airfoils import cloud_of
+from tests.geometry.poses import in_place
+from tests.geometry.test_twin import nominal
 
 NOISE_MM = 0.01
 
@@ -20,8 +22,8 @@ def found() -> tuple[tuple[Damage, ...], Bools, dict[Zone, object]]:
     cuts = (blades.tip_corner(), blades.pit(truth, 1.5 * np.pi, 48.0, 1.5, 3.2))
     scan = blades.scan(truth, cuts, pitch_mm=0.4, noise_mm=NOISE_MM)
     cloud, mask = cloud_of(scan.points, NOISE_MM), scan.label > 0
-    twin = fit_twin(cloud, mask, aligned(), nominal(), TwinSettings())
-    damages = find_damages(cloud, mask, aligned(), nominal(), twin)
+    twin = fit_twin(cloud, mask, in_place(), nominal(), TwinSettings())
+    damages = find_damages(cloud, mask, in_place(), nominal(), twin)
     return damages, mask, detection_limit(cloud, twin)
 
 

@@ -9,7 +9,9 @@ from geometry.damage import HOLLOW_SPACINGS, Damage, detection_limit, find_damag
 from geometry.twin import TwinSettings, fit_twin
 from geometry.types import Bools, Floats, Measurand, Zone
 from tests.geometry import twin_blades as blades
-from tests.geometry.test_twin import aligned, cloud_of, nominal
+from tests.geometry.airfoils import cloud_of
+from tests.geometry.poses import in_place
+from tests.geometry.test_twin import nominal
 
 NOISE_MM, PITCH_MM = 0.01, 0.4
 
@@ -38,8 +40,8 @@ def scanned(depth_mm: float, width_mm: float, seed: int) -> Case:
     hollowed = blades.hollowed(whole, centres, depth_mm, width_mm)
     scan = blades.scan(truth, cuts, pitch_mm=PITCH_MM, noise_mm=NOISE_MM, scanned=hollowed, seed=seed)
     cloud = cloud_of(scan.points, NOISE_MM)
-    twin = fit_twin(cloud, scan.label > 0, aligned(), nominal(), TwinSettings())
-    damages = find_damages(cloud, scan.label > 0, aligned(), nominal(), twin)
+    twin = fit_twin(cloud, scan.label > 0, in_place(), nominal(), TwinSettings())
+    damages = find_damages(cloud, scan.label > 0, in_place(), nominal(), twin)
     told = np.zeros(len(cloud), np.bool_)
     for damage in damages:
         told[damage.points] = True
