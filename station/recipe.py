@@ -15,7 +15,9 @@ from geometry.datums import DatumSettings
 from geometry.errors import BadInput
 from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
 from geometry.repair import RepairSettings
+from geometry.types import Mesh
 from station.config import Calibration
+from station.formats.cad import is_cad, read_cad
 from station.measurement import Outline
 from station.plans import BadPlan, BladePlan, check_span
 
@@ -67,7 +69,7 @@ def prepare_recipe(plan: BladePlan, axis: AxisCalibration | None = None) -> Reci
         hashlib.sha256(path.read_bytes()).hexdigest() for path in (plan.path, plan.nominal_path)
     )
     try:
-        mesh = read_nominal(plan.nominal_path, plan.units)
+        mesh = _nominal_mesh(plan)
         check_span(plan, float(mesh.vertices_mm[:, 2].min()), float(mesh.vertices_mm[:, 2].max()))
         nominal = prepare_nominal(mesh, nominal_settings(plan))
         check_datum(plan, nominal)
@@ -82,6 +84,12 @@ def prepare_recipe(plan: BladePlan, axis: AxisCalibration | None = None) -> Reci
         nominal_sha256=nominal_sha256,
         plan_sha256=plan_sha256,
     )
+
+
+def _nominal_mesh(plan: BladePlan) -> Mesh:
+    """A mesh counts in the unit that the plan states; a CAD file states its own."""
+    path = plan.nominal_path
+    return read_cad(path) if is_cad(path) else read_nominal(path, plan.units)
 
 
 def outline(nominal: Nominal, z_mm: float) -> Outline:

@@ -2,10 +2,12 @@
 
 import io
 import struct
+import sys
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import pye57
 import pytest
 import trimesh
 from hypothesis import given, settings
@@ -292,14 +294,21 @@ def test_e57_is_refused_clearly(tmp_path: Path) -> None:
     assert refusal(tmp_path, "a.e57", head) == "the header declares 4096 bytes, the file has 24"
 
 
-def test_e57_names_its_extra(tmp_path: Path) -> None:
-    try:
-        import pye57  # noqa: F401
-    except ImportError:
-        whole = b"ASTM-E57" + struct.pack("<IIQ", 1, 0, 24)
-        assert "bladecell[e57]" in refusal(tmp_path, "a.e57", whole)
-    else:
-        pytest.skip("the extra is installed")
+def test_e57_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pye57", None)  # as if it were not installed
+    whole = b"ASTM-E57" + struct.pack("<IIQ", 1, 0, 24)
+    assert "bladecell[e57]" in refusal(tmp_path, "a.e57", whole)
+
+
+def test_e57_gives_the_points_of_every_scan_and_a_damaged_one_a_line(tmp_path: Path) -> None:
+    first, second = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.array([[-7.0, 8.5, 9.25]])
+    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
+        for points in (first, second):
+            file.write_scan_raw({f"cartesian{axis}": points[:, i] for i, axis in enumerate("XYZ")})
+    assert np.array_equal(read_scan(tmp_path / "a.e57").points_mm, np.concatenate([first, second]))
+    content = (tmp_path / "a.e57").read_bytes()
+    assert "declares" in refusal(tmp_path, "b.e57", content[:-1024])
+    assert refusal(tmp_path, "c.e57", content[:48] + bytes(len(content) - 48)).startswith("E57: ")
 
 
 SEEDS = {
