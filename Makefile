@@ -6,7 +6,7 @@ DEMO ?= auto
 DEMO_FLAGS := $(if $(filter headless,$(DEMO)),--headless,)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint check bench bench-registration bench-sections bench-twin campaign lock picture
+.PHONY: help setup demo test lint check bench bench-registration bench-sections bench-twin bench-parts campaign lock picture
 
 help:      ## this list
 	@grep -E '^[a-z-]+: .*## ' Makefile | sed -E 's/:.*## /\t/' | expand -t 20
@@ -50,6 +50,11 @@ bench-twin: setup  ## twin and repair alone: section 5.5, six kinds of wear, vol
 	$(BIN)/python -m benchmarks.twin
 	$(BIN)/python -m benchmarks.damage
 	$(BIN)/python -m benchmarks.repair
+	$(BIN)/python -m benchmarks.twin_peers
+
+bench-parts: setup  ## whole parts from views to patches: occlusion, real blades as nominals
+	$(BIN)/python -m benchmarks.views
+	$(BIN)/python -m benchmarks.real_parts
 
 campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenario, all seeds of the twin
 	$(BIN)/python -m benchmarks.registration --full
@@ -57,6 +62,8 @@ campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenar
 	$(BIN)/python -m benchmarks.twin --full
 	$(BIN)/python -m benchmarks.thesis_twin --full
 	$(BIN)/python -m benchmarks.repair 10
+	$(BIN)/python -m benchmarks.twin_peers --full
+	$(BIN)/python -m benchmarks.views 5
 
 picture: setup  ## redraw the picture of the screen in the README
 	$(BIN)/python -m tests.station.tui.picture docs/screen.png
