@@ -1,12 +1,17 @@
 """The fields behind the twin, each against a slow or closed-form twin of its own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from geometry.freeform import COMPONENTS, bending_block, fit_freeform, lattice_over
-from geometry.kernels.ffd import add_block, evaluate, shapes
+from geometry.freeform import Lattice, lattice_over
+from geometry.kernels.covariance import TURN as ALIKE
+from geometry.kernels.covariance import carried, covariance, covariance_slopes, joint_covariance
+from geometry.kernels.ffd import evaluate
 from geometry.kernels.thinplate import TURN
+from geometry.kriging import AFFINE, Prior, Sample, fit_wear, likeliest_prior, sample_of, typical_prior
 from geometry.offset import BENDING_REACH, BENDING_WIDTH, Nodes, bending_energy, fit_offset, scatter_nodes
 from geometry.refine import refine
 from geometry.solid import check_solid, solid_normals, volume_mm3
@@ -20,7 +25,7 @@ def tensor_spline(points: Floats, counts: tuple[int, int, int], coefficients: Fl
         for axis, n in enumerate(counts)
     ]
     grid = coefficients.reshape(*counts[::-1], -1)
-    return np.einsum("pa,pb,pc,cbam->pm", *bases, grid)
+    return np.asarray(np.einsum("pa,pb,pc,cbam->pm", *bases, grid))
 
 
 def test_the_volumetric_spline_is_the_tensor_product() -> None:
@@ -32,51 +37,6 @@ def test_the_volumetric_spline_is_the_tensor_product() -> None:
     np.testing.assert_allclose(found, tensor_spline(points, counts, coefficients), atol=1e-12)
 
 
-def test_shapes_name_the_nodes_that_evaluate_uses() -> None:
-    rng = np.random.default_rng(2)
-    counts = np.array([5, 6, 7])
-    points = rng.uniform(0.0, 1.0, (50, 3)) * (counts - 3.0)
-    first, weights = shapes(points, counts)
-    steps = [(c * 6 + b) * 5 + a for c in range(4) for b in range(4) for a in range(4)]
-    values = rng.normal(size=(210, 1))
-    by_hand = (weights * values[first[:, None] + np.array(steps), 0]).sum(axis=1)
-    np.testing.assert_allclose(by_hand, evaluate(points, counts, values)[:, 0], atol=1e-12)
-
-
-def test_bending_block_is_the_integral_of_squared_second_derivatives() -> None:
-    rng = np.random.default_rng(3)
-    coefficients = rng.normal(size=(64, 1))
-    nodes, weights = np.polynomial.legendre.leggauss(5)
-    at = 0.5 * (nodes + 1.0)
-    points = np.array([[x, y, z] for z in at for y in at for x in at])
-    share = np.array([a * b * c for c in weights for b in weights for a in weights]) / 8.0
-    h = 1e-3
-
-    def value(shift: Floats) -> Floats:
-        return tensor_spline(np.clip(points + shift, 0.0, 1.0), (4, 4, 4), coefficients)[:, 0]
-
-    total = 0.0
-    for i, j in np.ndindex(3, 3):
-        e, f = h * np.eye(3)[i], h * np.eye(3)[j]
-        second = (value(e + f) - value(e - f) - value(f - e) + value(-e - f)) / (4.0 * h * h)
-        total += float((share * second**2).sum())
-    found = float(coefficients[:, 0] @ bending_block() @ coefficients[:, 0])
-    assert found == pytest.approx(total, rel=1e-4)
-
-
-def test_add_block_fills_the_lower_bands() -> None:
-    rng = np.random.default_rng(4)
-    dense, bands = np.zeros((9, 9)), np.zeros((9, 6))
-    for start in (0, 3):
-        unknowns = start + np.array([0, 1, 3, 5])
-        half = rng.normal(size=(4, 4))
-        dense[np.ix_(unknowns, unknowns)] += half + half.T
-        add_block(bands, unknowns, half + half.T)
-    for i, j in np.ndindex(9, 9):
-        if i >= j:
-            assert (bands[j, i - j] if i - j < 6 else 0.0) == pytest.approx(dense[i, j])
-
-
 def blade_like(rng: np.random.Generator, count: int) -> tuple[Floats, Floats]:
     """Points on an elliptic cylinder and their normals."""
     angle, z = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(0.0, 60.0, count)
@@ -85,25 +45,125 @@ def blade_like(rng: np.random.Generator, count: int) -> tuple[Floats, Floats]:
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def test_the_free_form_recovers_a_bend_it_can_represent() -> None:
-    points, normals = blade_like(np.random.default_rng(5), 4000)
+def test_the_lattice_follows_a_cubic_exactly() -> None:
+    rng = np.random.default_rng(2)
+    points, _ = blade_like(rng, 4000)
     lattice = lattice_over(points, 60)
-    bend = np.column_stack([0.002 * points[:, 2], 1e-4 * points[:, 2] ** 2, np.zeros(len(points))])
-    field = fit_freeform(
-        lattice,
-        points,
-        normals,
-        np.einsum("nj,nj->n", bend, normals),
-        np.full(len(points), 1e8),
-        stiffness=np.full(COMPONENTS, 1e2),
-        slide=1e-3,
-        form_mm=0.03,
+    terms = rng.normal(size=(4, 3))
+
+    def field(own: Floats) -> Floats:
+        return np.stack([(own / 20.0) ** k @ terms[k] for k in range(4)], axis=1)
+
+    found = evaluate(lattice.local(points)[0], lattice.counts, lattice.interpolate(field))
+    np.testing.assert_allclose(found, field(lattice.own(points)), atol=1e-9)
+
+
+PRIOR = np.array([0.05, 0.02, 30.0, 12.0, 0.004, 2.5])
+
+
+def slow_covariance(sample: Sample, others: Sample, prior: Floats) -> tuple[Floats, Floats]:
+    """Covariance of wear, and that of ripple."""
+    off = sample.places_mm[:, None] - others.places_mm
+    r = np.linalg.norm(off / prior[[3, 3, 2]], axis=2) * np.sqrt(5.0)
+    alike = (1.0 + r + r**2 / 3.0) * np.exp(-r)
+    together = sample.normals @ others.normals.T
+    wear = (AFFINE[0] ** 2 + prior[0] ** 2 * alike) * together
+    in_section = sample.normals[:, :2] @ others.normals[:, :2].T
+    wear += AFFINE[1] ** 2 * (sample.places_mm @ others.places_mm.T) * in_section
+    wear += prior[1] ** 2 * alike * np.outer(sample.swell, others.swell)
+    b = np.sqrt(3.0) * np.linalg.norm(off, axis=2) / prior[5]
+    turned = np.linalg.norm(sample.normals[:, None] - others.normals, axis=2)
+    return wear, prior[4] ** 2 * (1.0 + b) * np.exp(-b - 0.5 * (turned / ALIKE) ** 2)
+
+
+def places(seed: int, count: int) -> tuple[Lattice, Sample]:
+    rng = np.random.default_rng(seed)
+    points, normals = blade_like(rng, count)
+    lattice = lattice_over(blade_like(rng, 4000)[0], 200)
+    return lattice, sample_of(lattice, points, normals, np.zeros(count), np.full(count, 1e-6))
+
+
+def test_covariances_are_those_of_the_formula() -> None:
+    _, some = places(3, 40)
+    _, others = places(4, 30)
+    wear, _ = slow_covariance(some, others, PRIOR)
+    asked = (some.places_mm, some.normals, some.swell, others.places_mm, others.normals, others.swell)
+    np.testing.assert_allclose(covariance(*asked, PRIOR, AFFINE), wear, atol=1e-12)
+    joint = joint_covariance(*asked[:3], PRIOR, AFFINE, some.variance_mm2)
+    whole = sum(slow_covariance(some, some, PRIOR)) + np.diag(some.variance_mm2)
+    np.testing.assert_allclose(joint, np.triu(whole), atol=1e-11)
+    sources = np.random.default_rng(5).normal(size=(30, 2))
+    alike = slow_covariance(some, others, PRIOR * [1.0, 0.0, 1.0, 1.0, 1.0, 1.0])[0]
+    bare = slow_covariance(some, others, PRIOR * [1e-9, 0.0, 1.0, 1.0, 1.0, 1.0])[0]
+    correlation = (alike - bare) / (PRIOR[0] ** 2 * some.normals @ others.normals.T)
+    found = carried(some.places_mm, others.places_mm, PRIOR, sources)
+    np.testing.assert_allclose(found, correlation @ sources, atol=1e-6)
+
+
+def test_slopes_of_the_likelihood_are_its_differences() -> None:
+    _, some = places(6, 60)
+    weights = np.random.default_rng(7).normal(size=(60, 60))
+    weights += weights.T
+    asked = (some.places_mm, some.normals, some.swell)
+    found = covariance_slopes(*asked, PRIOR, weights)
+    for k in range(6):
+        step = np.exp(1e-4 * np.eye(6)[k])
+        high, low = (sum(slow_covariance(some, some, PRIOR * s)) for s in (step, 1.0 / step))
+        assert found[k] == pytest.approx(float((weights * (high - low)).sum() / 2e-4), rel=1e-4, abs=1e-12)
+
+
+def drawn(seed: int) -> tuple[Lattice, Sample, Sample, Floats]:
+    """Wear drawn from its prior: a sample seen below 45 mm with ripple and noise, and places everywhere."""
+    lattice, whole = places(seed, 700)
+    wear, ripple = slow_covariance(whole, whole, PRIOR)
+    rng = np.random.default_rng(seed)
+    truth, ripples = (
+        rng.multivariate_normal(np.zeros(700), matrix, method="cholesky")
+        for matrix in (wear + 1e-12 * np.eye(700), ripple + 1e-12 * np.eye(700))
     )
-    np.testing.assert_allclose(field.along(points, normals), np.einsum("nj,nj->n", bend, normals), atol=2e-4)
-    spread = field.draws(np.random.default_rng(0), points, normals, 64).std(axis=1)
-    assert spread.max() < 1e-3
+    values = truth + ripples + rng.normal(0.0, 1e-3, 700)
+    order = np.argsort(whole.places_mm[:, 2])[:500]
+    seen = replace(whole, value_mm=values).only(order)
+    return lattice, seen, whole, truth
+
+
+def test_wear_and_its_sigma_are_honest_where_seen_and_beyond() -> None:
+    ratios = []
+    for seed in range(3):
+        lattice, seen, whole, truth = drawn(seed)
+        wear = fit_wear(seen, Prior.of(PRIOR), lattice)
+        points, normals = whole.places_mm @ lattice.axes, whole.normals @ lattice.axes
+        error_mm = wear.freeform.along(points, normals) - truth
+        sigma_mm = wear.sigma_mm(points, normals)
+        beyond = whole.places_mm[:, 2] > seen.places_mm[:, 2].max() + 5.0
+        assert sigma_mm[beyond].mean() > 2.0 * sigma_mm[~beyond].mean()
+        ratios.append([np.sqrt(np.mean((error_mm / sigma_mm)[part] ** 2)) for part in (beyond, ~beyond)])
+    assert (np.mean(ratios, axis=0) > 0.6).all()
+    assert (np.mean(ratios, axis=0) < 1.4).all()
+
+
+def test_the_prior_is_found_again_in_what_it_made() -> None:
+    lattice, seen, _, _ = drawn(8)
+    start = typical_prior(lattice)
+    found = likeliest_prior(seen, start, lattice, 500).numbers
+    ratio = found[[0, 2, 3, 4]] / PRIOR[[0, 2, 3, 4]]
+    assert (ratio > 0.5).all()
+    assert (ratio < 2.0).all()
+
+
+def test_a_bend_runs_on_beyond_what_is_seen() -> None:
+    points, normals = blade_like(np.random.default_rng(5), 1500)
+    lattice = lattice_over(points, 200)
+    bend = np.column_stack([0.002 * points[:, 2], 1e-4 * points[:, 2] ** 2, np.zeros(len(points))])
+    along_mm = np.einsum("nj,nj->n", bend, normals)
+    seen = points[:, 2] < 50.0
+    sample = sample_of(lattice, points[seen], normals[seen], along_mm[seen], np.full(int(seen.sum()), 1e-6))
+    wear = fit_wear(sample, likeliest_prior(sample, typical_prior(lattice), lattice, 400), lattice)
+    error_mm = wear.freeform.along(points, normals) - along_mm
+    assert np.abs(error_mm[seen]).max() < 1e-3
+    assert np.abs(error_mm).max() < 0.02
     far = np.array([[0.0, 0.0, 400.0]])
-    np.testing.assert_allclose(field.shift(far)[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(wear.freeform.shift(far)[0], 0.0, atol=1e-12)
 
 
 def test_nodes_keep_their_distance_and_cover_the_surface() -> None:
