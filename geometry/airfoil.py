@@ -1,13 +1,14 @@
 """The inspected sections: position, orientation, chord, thickness, edges, profile, each with its sigma."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import lru_cache
 
 import numpy as np
 
-from geometry.chart import NODES, Chart, SectionSettings, unroll
+from geometry.chart import Chart, SectionSettings, unroll
 from geometry.curve import Estimate, centroid, node_shares
 from geometry.errors import CannotMeasure
 from geometry.form import SIDES, share_beyond_sigma
@@ -38,6 +39,8 @@ __all__ = [
     "with_damages",
 ]
 
+_AT_ONCE = 2  # sections; none knows of another, and most of their time is spent in compiled code
+
 
 class SectionStatus(StrEnum):
     MEASURED = "measured"
@@ -66,6 +69,8 @@ class Section:
 
     `measurands` has every name of `section_measurands`; one whose support touches a damage is
     `NotMeasured(..., in_damage=True)`. `nominals` gives the nominal value of each that the nominal has.
+    `band_mm` are the heights between which points took part, taken as smooth in z, and `band_points` how many
+    they were: None and 0 where none did.
     `zones` tells of "le", "ss", "te" and "ps" how much of the arc has points. `stacking` is there when both
     position and orientation are.
     `profile_mm` (m, 2) are points of the measured profile where it was measured, in order,
@@ -84,6 +89,8 @@ class Section:
     run: Ints
     zones: Mapping[str, ZoneArc] = field(default_factory=dict)
     stacking: Stacking | None = None
+    band_mm: tuple[float, float] | None = None
+    band_points: int = 0
 
 
 def measure_sections(
@@ -102,7 +109,8 @@ def measure_sections(
     scan = Scan(
         points_mm=apply(alignment.T_nominal_scan, cloud.points_mm), sigma_mm=cloud.sigma_mm, mask=mask
     )
-    return tuple(_measure(scan, alignment, nominal, float(z), settings) for z in z_mm)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        return tuple(pool.map(lambda z: _measure(scan, alignment, nominal, float(z), settings), z_mm))
 
 
 def _measure(
@@ -119,7 +127,7 @@ def _measure(
     return _section(replace(profile, gaps=gaps), definition, alignment)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)
 def _prepared(nominal: Nominal, z_mm: float, settings: SectionSettings) -> tuple[Chart, Definition]:
     """What the nominal alone gives for one section; a blade of the same part finds it ready."""
     chart = unroll(nominal, z_mm, settings.widest_band_mm, settings)
@@ -155,6 +163,8 @@ def _section(profile: Profile, definition: Definition, alignment: Alignment) -> 
         run=run,
         zones=dict(zip(SIDES, profile.zones, strict=True)),
         stacking=_stacking(profile, definition, uncertainty) if seen.all() else None,
+        band_mm=profile.band_mm,
+        band_points=profile.band_points,
     )
 
 
@@ -199,19 +209,9 @@ def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty)
         along, rms_mm = sigmas["waviness_rms_mm"], estimates["waviness_rms_mm"].value
         sigmas["waviness_rms_mm"] = waves.rms_sigma(rms_mm, along, amplitudes)
         sigmas["out_of_tolerance_fraction"] = share_beyond_sigma(
-            profile.deviation_mm, _node_sigmas(profile), share, definition.settings.tolerance_mm
+            profile.deviation_mm, profile.node_sigmas(), share, definition.settings.tolerance_mm
         )
     return sigmas
-
-
-def _node_sigmas(profile: Profile) -> Floats:
-    """Standard uncertainty (NODES,) of the displacement of each node, from every 16th."""
-    some = np.arange(0, NODES, 16)
-    each = np.zeros((len(some), NODES))
-    each[np.arange(len(some)), some] = 1.0
-    covariance = profile.covariance(each).diagonal()
-    sigma = np.sqrt(np.append(covariance, covariance[0]))
-    return np.interp(np.arange(NODES), np.append(some, NODES), sigma)
 
 
 def _stacking(profile: Profile, definition: Definition, uncertainty: _Uncertainty) -> Stacking:

@@ -26,11 +26,12 @@ from geometry.kernels.profile_spline import (
 )
 from geometry.types import Bools, Floats
 
-_PILOT_POINTS = 10_000  # of a band, to tell outliers
+_PILOT_POINTS = 10_000  # of a band, to tell outliers ...
 _BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # of what is told from outliers: sides, edges, along the span
-_START = np.array([5e4, 2e4, 4e6])  # of the search for the strengths: those of a blade in service
+_START = np.array([5e4, 5e4, 1e8])  # of the search for the strengths: those of a blade in service
 _RIGID_PRIOR = np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0  # weak: `find_motion` has taken most
-_BINS = (4, 8)  # in each knot span along the arc, and across
+_PILOT_BINS = (2, 4)  # ... in each knot span along the arc, and across
+_BINS = (4, 8)  # the same for all points
 _LIKELIER = 9.0  # twice the gain in log likelihood
 _ARM_MM = 10.0  # a turn counts as the movement of a point so far from the centroid
 
@@ -52,13 +53,17 @@ class Knots:
         """Knot spans of heights."""
         return (z_mm - self.low_mm) / self.step_mm
 
-    def weights(self, gradients: Floats, z_mm: float) -> Floats:
-        """Weights (p, q, n) of the coefficients in n functions (n, NODES) of the node displacements."""
+    def across(self, z_mm: float) -> Floats:
+        """Weights (q,) of the coefficients of a row at a height."""
         v = self.v(np.array([z_mm]))
         first = np.clip(v.astype(np.int64), 0, self.q - 4)
         across = np.zeros(self.q)
         across[first[0] : first[0] + 4] = cubic_weights(v, first)[0]
-        weights: Floats = self.along(gradients)[:, None, :] * across[:, None]
+        return across
+
+    def weights(self, gradients: Floats, z_mm: float) -> Floats:
+        """Weights (p, q, n) of the coefficients in n functions (n, NODES) of the node displacements."""
+        weights: Floats = self.along(gradients)[:, None, :] * self.across(z_mm)[:, None]
         return weights
 
     def along(self, gradients: Floats) -> Floats:
@@ -129,11 +134,11 @@ class LaidBand:
     u: Floats
     v: Floats
 
-    def sums(self, keep: Bools, penalty: Penalty) -> Sums:
+    def sums(self, keep: Bools, penalty: Penalty, bins_a_span: tuple[int, int]) -> Sums:
         """Weighted sums of some points: the means of small bins stand for the points in them."""
         rows, knots = self.band.rows, self.knots
         weight = np.where(keep, self.band.sigma_mm**-2.0, 0.0)
-        bins = band_bins(self.u, self.v, rows, weight, (knots.p, knots.q - 3), _BINS)
+        bins = band_bins(self.u, self.v, rows, weight, (knots.p, knots.q - 3), bins_a_span)
         sums = gather(bins[:, 0], bins[:, 1], bins[:, 3], bins[:, 2], bins[:, 4:], penalty.layout)
         return replace(
             sums,
@@ -173,18 +178,10 @@ def onto_chart(
 
     On a slanted surface the distance in the plane is longer than along the normal, and so is its sigma.
     """
-    back = motion.undo(points_mm)
-    foot = chart.project(back)
-    steep = np.abs(chart.steepness(foot[:, 0], back[:, 2]))
-    near = np.flatnonzero((steep <= settings.steepest) & (np.abs(foot[:, 1]) <= settings.capture_mm))
-    back, foot, steep = (each.take(near, axis=0) for each in (back, foot, steep))
-    height = (back[:, 2] - chart.section_z_mm) / settings.band_mm
-    return Band(
-        node=foot[:, 0],
-        z_mm=back[:, 2],
-        sigma_mm=sigma_mm[near] * np.sqrt(1.0 + steep * steep),
-        rows=np.column_stack([foot[:, 1], back[:, :2] - motion.pivot_mm, foot[:, 2:], height]),
-    )
+    number, place, rows = chart.lay(points_mm, motion, settings.capture_mm, settings.steepest)
+    rows[:, 5] /= settings.band_mm
+    node, z_mm, longer = place.T
+    return Band(node=node, z_mm=z_mm, sigma_mm=sigma_mm[number] * longer, rows=rows)
 
 
 def robust_fit(
@@ -200,13 +197,13 @@ def robust_fit(
     few = band.every(max(1, len(band.node) // _PILOT_POINTS)).laid(knots)
     keep = np.ones(len(few.u), bool)
     for limit in (2.0 * settings.outlier, settings.outlier):
-        pilot = eliminate(few.sums(keep, penalty), penalty, _BENDING_PER_MM**-2.0)
+        pilot = eliminate(few.sums(keep, penalty, _PILOT_BINS), penalty, _BENDING_PER_MM**-2.0)
         coefficients = pilot.values(penalty.layout)
         misfit = few.misfit(coefficients, pilot.free)
         most = limit * 1.4826 * float(np.median(misfit))
         keep = misfit <= most
     keep = laid.misfit(coefficients, pilot.free) <= most
-    fit = fit_spline(laid.sums(keep, penalty), penalty, _START)
+    fit = fit_spline(laid.sums(keep, penalty, _BINS), penalty, _START)
     return keep, knots, _steadied(fit, knots, chart.curve_mm)
 
 

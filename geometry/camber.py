@@ -97,3 +97,25 @@ def thickest_at(curve_mm: Floats, pair: Pair, line: Line) -> Estimate:
     np.add.at(gradient, pair.node, 0.5 * felt)
     np.add.at(gradient, contact, 0.5 * felt)
     return Estimate(value=middle + reach * float(vertex), gradient=gradient)
+
+
+def thickness_at(
+    curve_mm: Floats, pair: Pair, end: tuple[Floats, Floats], inward: Floats, distance_mm: float
+) -> Estimate:
+    """Diameter of the inscribed circle whose centre is `distance_mm` inward of an end of the caliper chord.
+
+    From the circles in the nodes of the pair, by a straight line through their radii: where the section
+    tapers, an edge that moves takes the place along. `end`: its place (2,) and growth (2, m).
+    """
+    normals = outward_normals(curve_mm)
+    radius, contact = inscribed_circles(curve_mm, normals, pair.node, pair.across)
+    place = (curve_mm[pair.node] - radius[:, None] * normals[pair.node] - end[0]) @ inward
+    off = place - place.mean()
+    slope = float(off @ radius) / float(off @ off)
+    value = 2.0 * (float(radius.mean()) + slope * (distance_mm - float(place.mean())))
+    wedge = -(normals[pair.node] * normals[contact]).sum(axis=1)  # 1 where the two sides are parallel
+    share = 2.0 / (len(radius) * (1.0 + wedge))
+    gradient = 2.0 * slope * (inward @ end[1])
+    np.add.at(gradient, pair.node, share * wedge)
+    np.add.at(gradient, contact, share)
+    return Estimate(value=value, gradient=gradient)

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.errors import BadInput
-from geometry.kernels.profile import project, steepness, undo_motion
+from geometry.kernels.airfoil import closed_normals, closed_steps
+from geometry.kernels.profile import lay, project, undo_motion
 from geometry.nominal import Nominal, NominalSection
 from geometry.types import Bools, Floats, Ints
 
@@ -50,7 +51,8 @@ class FitSettings:
 class SectionSettings:
     """How sections are reconstructed."""
 
-    max_gap_mm: float = 1.5  # an arc without points wider than this was not measured
+    max_gap_mm: float = 1.5  # an arc without points wider than this was not measured ...
+    gap_share: float = 0.008  # ... or wider than this share of the perimeter, if chance leaves none such
     band_mm: float = 6.0  # neighbouring z on each side that takes part, at least ...
     band_spacings: float = 60.0  # ... and of a sparser scan so many times the distance of its points, ...
     widest_band_mm: float = 12.0  # ... but no more than this
@@ -77,6 +79,7 @@ class SectionSettings:
     def __post_init__(self) -> None:
         lengths = (self.max_gap_mm, self.band_mm, self.layer_mm, self.knot_mm, self.edge_mm, self.z_knot_mm)
         asked = (
+            self.gap_share,
             self.band_spacings,
             self.widest_band_mm,
             self.tolerance_mm,
@@ -109,6 +112,7 @@ class Chart:
     arc_mm: Floats  # (NODES + 1,) along the section itself, closed
     side: Ints  # (NODES,) as in `NominalSection`: 0 leading edge, 1 suction, 2 trailing edge, 3 pressure
     seeds: Ints
+    across_mm: Floats  # (NODES,) how far the nearest node of the other side is
     corner_mm: Floats
     cell_mm: float
 
@@ -127,7 +131,8 @@ class Chart:
     def project(self, points_mm: Floats) -> Floats:
         """Node coordinate, signed in-plane distance and outward normal of (n, 3) points: (n, 4)."""
         points = np.ascontiguousarray(points_mm)
-        return project(points, self.z_mm, self.curves, self.seeds, self.corner_mm, self.cell_mm)
+        grid = self.seeds, self.across_mm, self.corner_mm, self.cell_mm
+        return project(points, self.z_mm, self.curves, *grid)
 
     def growth(self) -> Floats:
         """How the nodes move with z at the section itself, (NODES, 2) mm per mm."""
@@ -135,9 +140,17 @@ class Chart:
         growth: Floats = (self.nodes_mm[high] - self.nodes_mm[low]) / (self.z_mm[high] - self.z_mm[low])
         return growth
 
-    def steepness(self, node: Floats, z_mm: Floats) -> Floats:
-        """Steepness of the nominal, mm outward per mm of height, at points of the chart; NaN: unknown."""
-        return steepness(node, z_mm, self.z_mm, self.growth_of_nodes, self.trusted)
+    def lay(
+        self, points_mm: Floats, motion: "Motion", capture_mm: float, steepest: float
+    ) -> tuple[Ints, Floats, Floats]:
+        """What of the points (n, 3), their motion undone, is near and upright enough: see the kernel."""
+        return lay(
+            np.ascontiguousarray(points_mm),
+            (motion.pivot_mm, motion.z_mm, motion.rest, motion.per_mm),
+            (self.z_mm, self.curves, self.growth_of_nodes, self.trusted),
+            (self.seeds, self.across_mm, self.corner_mm, self.cell_mm),
+            (capture_mm, steepest),
+        )
 
     def arc_at(self, node: Floats) -> Floats:
         """Arc length on the section of node coordinates."""
@@ -166,7 +179,7 @@ def unroll(nominal: Nominal, z_mm: float, reach_mm: float, settings: SectionSett
     heights = [float(low), *(height for three in threes for height in three.above_mm)]
     nodes = np.stack([nodes_at(height) for height in heights])
     here = heights.index(z_mm)
-    seeds, corner, cell = _seeds(nodes, here)
+    seeds, across, corner, cell = _seeds(nodes, here)
     arc = np.concatenate([[0.0], np.cumsum(_lengths(nodes[here]))])
     return Chart(
         z_mm=np.array(heights),
@@ -178,6 +191,7 @@ def unroll(nominal: Nominal, z_mm: float, reach_mm: float, settings: SectionSett
         arc_mm=arc,
         side=_sides(nominal.section(z_mm), nodes[here]),
         seeds=seeds,
+        across_mm=across,
         corner_mm=corner,
         cell_mm=cell,
     )
@@ -185,8 +199,13 @@ def unroll(nominal: Nominal, z_mm: float, reach_mm: float, settings: SectionSett
 
 def outward_normals(curve_mm: Floats) -> Floats:
     """Unit outward normals (m, 2) of a closed counter-clockwise curve, from each node's neighbours."""
-    along = np.roll(curve_mm, -1, axis=0) - np.roll(curve_mm, 1, axis=0)
-    return np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+    return np.asarray(closed_normals(np.ascontiguousarray(curve_mm)))
+
+
+def outward_normal(curve_mm: Floats, node: int) -> Floats:
+    """The same at one node, (2,)."""
+    x, y = curve_mm[(node + 1) % len(curve_mm)] - curve_mm[node - 1]
+    return np.array([y, -x]) / np.hypot(x, y)
 
 
 def _parabolas(nodes_mm: Floats) -> Floats:
@@ -239,7 +258,7 @@ def _bridge(
 
 def _lengths(curve_mm: Floats) -> Floats:
     """Length of the segment from each node to the next one, closed."""
-    return np.linalg.norm(np.roll(curve_mm, -1, axis=0) - curve_mm, axis=1)
+    return np.asarray(closed_steps(np.ascontiguousarray(curve_mm)))
 
 
 def _side_lengths(section: NominalSection) -> tuple[float, float]:
@@ -282,8 +301,9 @@ def _sides(section: NominalSection, nodes_mm: Floats) -> Ints:
     return section.side[cKDTree(section.curve_mm).query(nodes_mm)[1]]
 
 
-def _seeds(nodes_mm: Floats, here: int) -> tuple[Ints, Floats, float]:
-    """For each cell of a grid over the section the nearest node, and the one on the other side if near too.
+def _seeds(nodes_mm: Floats, here: int) -> tuple[Ints, Floats, Floats, float]:
+    """For each cell of a grid over the section the nearest node, and the one on the other side if near too;
+    and how far the other side is from each node, (NODES,).
 
     Near: within what the size of a cell and the movement of the nodes over the band can hide.
     """
@@ -294,12 +314,14 @@ def _seeds(nodes_mm: Floats, here: int) -> tuple[Ints, Floats, float]:
     count = np.ceil((curve.max(axis=0) + margin - corner) / cell).astype(np.int64)
     at = corner + cell * (np.indices(tuple(count)).reshape(2, -1).T + 0.5)
     half = NODES // 2
-    away, near = np.transpose([cKDTree(curve[i : i + half]).query(at) for i in (0, half)], (1, 2, 0))
+    sides = [cKDTree(curve[i : i + half]) for i in (0, half)]
+    away, near = np.transpose([side.query(at) for side in sides], (1, 2, 0))
+    across = np.concatenate([sides[1].query(curve[:half])[0], sides[0].query(curve[half:])[0]])
     nodes = near.astype(np.int64) + np.array([0, half])
     first = np.argmin(away, axis=1)
     rows = np.arange(len(at))
     other = np.where(away[rows, 1 - first] - away[rows, first] < doubt, nodes[rows, 1 - first], -1)
-    return np.column_stack([nodes[rows, first], other]).reshape(*count, 2), corner, cell
+    return np.column_stack([nodes[rows, first], other]).reshape(*count, 2), across, corner, cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -339,7 +361,7 @@ def find_motion(chart: Chart, points_mm: Floats) -> Motion:
     pivot, z_mm = chart.curve_mm.mean(axis=0), chart.section_z_mm
     prior = np.array([1.0, 1.0, 0.02, 0.1, 0.1, 0.002]) ** -2.0
     total = np.zeros(6)
-    some = points_mm[:: max(1, len(points_mm) // 4000)]
+    some = points_mm[:: max(1, len(points_mm) // 2000)]
     for _ in range(6):
         motion = Motion(pivot_mm=pivot, z_mm=z_mm, rest=total[:3], per_mm=total[3:])
         back = motion.undo(some)

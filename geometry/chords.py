@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from geometry.chart import outward_normals
+from geometry.chart import outward_normal
 from geometry.curve import Edge, Estimate
 from geometry.errors import CannotMeasure
 from geometry.kernels.airfoil import farthest_pair
 from geometry.types import Floats, Ints
+
+_SETTLED_MM = 1e-9  # what moves less, end or unit direction, has settled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,7 +89,9 @@ def chord(curve_mm: Floats, le: Edge, te: Edge) -> Chord:
     for _ in range(4):
         along = ends / np.linalg.norm(ends)
         front, back = touch(curve_mm, nose, -along), touch(curve_mm, tail, along)
-        ends = back.point_mm - front.point_mm
+        before, ends = ends, back.point_mm - front.point_mm
+        if np.abs(ends - before).max() < _SETTLED_MM:
+            break
     length = float(np.linalg.norm(ends))
     lever = length - front.radius_mm - back.radius_mm
     swing = (back.radius_mm * back.slope + front.radius_mm * front.slope) / lever
@@ -98,7 +102,7 @@ def chord(curve_mm: Floats, le: Edge, te: Edge) -> Chord:
 
 def _moved(curve_mm: Floats, contact: Contact) -> Floats:
     """(2, m): how a contact moves with each node, along the normal, while its direction stays."""
-    normal = outward_normals(curve_mm)[contact.node]
+    normal = outward_normal(curve_mm, contact.node)
     moved = np.outer([-normal[1], normal[0]], contact.radius_mm * contact.slope)
     moved[:, contact.node] += normal
     return moved
@@ -131,7 +135,7 @@ def _tip(curve_mm: Floats, end: Edge) -> tuple[Contact, Floats]:
     """The point of an edge farthest along its own direction, and how it moves: that direction turns too."""
     contact = _farthest(curve_mm, end.zone, end.direction(curve_mm))
     moved = _moved(curve_mm, contact)
-    normal = outward_normals(curve_mm)[contact.node]
+    normal = outward_normal(curve_mm, contact.node)
     turn = sum(0.5 * touch(curve_mm, node, normal).steepness for node in end.flank)
     return contact, moved - np.outer([-normal[1], normal[0]], contact.radius_mm * turn)
 
@@ -164,14 +168,15 @@ def tangent_chord(curve_mm: Floats, le: Edge, te: Edge, down: Floats) -> Estimat
         line = other.point_mm - one.point_mm
         line = line / np.linalg.norm(line)
         turned = np.array([line[1], -line[0]])
-        down = turned if float(turned @ down) > 0.0 else -turned
+        before, down = down, turned if float(turned @ down) > 0.0 else -turned
+        if np.abs(down - before).max() < _SETTLED_MM:
+            break
     nose, tail = _farthest(curve_mm, front, -line), _farthest(curve_mm, back, line)
-    normals = outward_normals(curve_mm)
     gradient = np.zeros(len(curve_mm))
-    gradient[nose.node] -= float(normals[nose.node] @ line)
-    gradient[tail.node] += float(normals[tail.node] @ line)
+    gradient[nose.node] -= float(outward_normal(curve_mm, nose.node) @ line)
+    gradient[tail.node] += float(outward_normal(curve_mm, tail.node) @ line)
     ends = tail.point_mm - nose.point_mm
     lean = float(ends @ down) / float(np.linalg.norm(other.point_mm - one.point_mm))
-    gradient[other.node] += lean * float(normals[other.node] @ down)
-    gradient[one.node] -= lean * float(normals[one.node] @ down)
+    gradient[other.node] += lean * float(outward_normal(curve_mm, other.node) @ down)
+    gradient[one.node] -= lean * float(outward_normal(curve_mm, one.node) @ down)
     return Estimate(value=float(ends @ line), gradient=gradient)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.chart import outward_normals
+from geometry.chart import outward_normal, outward_normals
 from geometry.errors import CannotMeasure
-from geometry.kernels.airfoil import inscribed_circles
+from geometry.kernels.airfoil import area_moments, closed_steps, inscribed_circles
 from geometry.kernels.profile import nearest_nodes
 from geometry.types import Floats, Ints
 
@@ -26,8 +26,8 @@ class Estimate:
 
 def node_shares(curve_mm: Floats) -> Floats:
     """Arc length that each node of a closed curve stands for, (m,)."""
-    after = np.linalg.norm(np.roll(curve_mm, -1, axis=0) - curve_mm, axis=1)
-    shares: Floats = 0.5 * (after + np.roll(after, 1))
+    after = closed_steps(np.ascontiguousarray(curve_mm))
+    shares: Floats = 0.5 * (after + np.concatenate([after[-1:], after[:-1]]))
     return shares
 
 
@@ -39,17 +39,13 @@ def node_arc(curve_mm: Floats) -> Floats:
 
 def area(curve_mm: Floats) -> float:
     """Enclosed area of a counter-clockwise closed polygon, mm2."""
-    x, y = curve_mm.T
-    return 0.5 * float(x @ np.roll(y, -1) - np.roll(x, -1) @ y)
+    return float(area_moments(np.ascontiguousarray(curve_mm))[0])
 
 
 def centroid(curve_mm: Floats) -> Floats:
     """Centroid (2,) of the enclosed area: the stacking point of the section."""
-    x, y = curve_mm.T
-    x1, y1 = np.roll(x, -1), np.roll(y, -1)
-    cross = x * y1 - x1 * y
-    moment = np.array([(x + x1) @ cross, (y + y1) @ cross])
-    return moment / (6.0 * area(curve_mm))
+    whole, x, y = area_moments(np.ascontiguousarray(curve_mm))
+    return curve_mm[0] + np.array([x, y]) / whole
 
 
 def centroid_gradient(curve_mm: Floats) -> Floats:
@@ -97,8 +93,7 @@ class Edge:
     def direction(self, curve_mm: Floats) -> Floats:
         """The unit direction (2,) in which the edge of a curve points: halfway between its flanks."""
         one, other = self.flank
-        normals = outward_normals(curve_mm)
-        apart = normals[one] - normals[other]
+        apart = outward_normal(curve_mm, one) - outward_normal(curve_mm, other)
         halfway = np.array([apart[1], -apart[0]]) / np.linalg.norm(apart)
         outward = 2.0 * curve_mm[self.zone[len(self.zone) // 2]] - curve_mm[one] - curve_mm[other]
         return halfway if float(halfway @ outward) > 0.0 else -halfway
@@ -200,7 +195,10 @@ def _span(nodes: Ints) -> Ints:
 
 
 def thickness(curve_mm: Floats, pair: Pair) -> Estimate:
-    """Diameter of the largest inscribed circle that touches the curve in nodes of the pair."""
+    """Diameter of the largest inscribed circle that touches the curve in nodes of the pair.
+
+    Where the sides are not parallel it grows with the slope in its node, too.
+    """
     normals = outward_normals(curve_mm)
     radius, contact = inscribed_circles(curve_mm, normals, pair.node, pair.across)
     best = int(np.argmax(radius))
@@ -208,10 +206,17 @@ def thickness(curve_mm: Floats, pair: Pair) -> Estimate:
     wedge = -float(normals[node] @ normals[across])  # 1 where the two sides are parallel
     gradient = np.zeros(len(curve_mm))
     gradient[[node, across]] = 2.0 * wedge / (1.0 + wedge), 2.0 / (1.0 + wedge)
+    before, after = node - 1, (node + 1) % len(curve_mm)
+    along, chord = curve_mm[after] - curve_mm[before], curve_mm[across] - curve_mm[node]
+    tilt = 2.0 * float(radius[best]) * float(chord @ along) / float(chord @ normals[node])
+    gradient[after] += tilt / float(along @ along)
+    gradient[before] -= tilt / float(along @ along)
     return Estimate(value=2.0 * float(radius[best]), gradient=gradient)
 
 
-def gauge(camber: CamberLine, from_mm: Floats, along: Floats, distance_mm: float) -> Pair:
-    """The pair of the nominal circle whose centre is `distance_mm` from a point along a direction."""
+def gauge(camber: CamberLine, from_mm: Floats, along: Floats, distance_mm: float, around: int = 0) -> Pair:
+    """The pair of the nominal circle whose centre is `distance_mm` from a point along a direction, and of so
+    many `around` it on both sides."""
     near = int(np.argmin(np.abs((camber.centre_mm - from_mm) @ along - distance_mm)))
-    return Pair(node=camber.node[near : near + 1], across=_span(camber.contact[near : near + 1]))
+    some = slice(max(near - around, 0), near + around + 1)
+    return Pair(node=camber.node[some], across=_span(camber.contact[some]))

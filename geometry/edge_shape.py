@@ -81,7 +81,8 @@ def min_radius(curve_mm: Floats, end: Edge, window_mm: float) -> Estimate:
     """The smallest radius of curvature on the rounding of an edge, over windows `window_mm` of arc wide.
 
     Each is the radius of the circle through the ends and the middle of its window; the narrower the
-    window, the noisier the radius.
+    window, the noisier the radius. The least of many scatters less than each: the gradient is that of the
+    one window, and the sigma from it a bound.
     """
     edge = _unroll(curve_mm, end)
     node = _inside(end)
@@ -100,7 +101,9 @@ def flat(curve_mm: Floats, end: Edge, flat_mm: float) -> Estimate:
     """The longest chord on the rounding of an edge over which the profile bulges no more than `flat_mm`.
 
     The chord's middle and both its ends lie on the rounding. A circle of radius R has flats of about
-    sqrt(8 R flat_mm); a blunt edge has one as wide as its rounding.
+    sqrt(8 R flat_mm); a blunt edge has one as wide as its rounding. No Gaussian describes the longest of
+    many chords, each with noise as large as its bulge: the gradient is that of the one found, and the sigma
+    from it a bound, up to three times too large.
     """
     edge = _unroll(curve_mm, end)
     node = _inside(end)

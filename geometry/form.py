@@ -46,7 +46,8 @@ def share_beyond_sigma(
 ) -> float:
     """Sigma of `share_beyond`: half the way from where every node is a sigma better to a sigma worse.
 
-    So much at most, for it takes the errors of all nodes for one.
+    So much at most, for it takes the errors of all nodes for one: a bound, no Gaussian's sigma, about one
+    and a half times what a fraction between 0 and 1 scatters by.
     """
     better = share_beyond(deviation_mm, share_mm, tolerance_mm + sigma_mm)
     worse = share_beyond(deviation_mm, share_mm, np.maximum(tolerance_mm - sigma_mm, 0.0))

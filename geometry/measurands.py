@@ -8,10 +8,11 @@ support has a gap there is no number.
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
 
 import numpy as np
 
-from geometry.camber import max_camber, thickest_at
+from geometry.camber import max_camber, thickest_at, thickness_at
 from geometry.chart import SectionSettings
 from geometry.chords import Chord, Line, chord, hollow, nose_tail_chord, tangent_chord
 from geometry.curve import (
@@ -38,6 +39,7 @@ from geometry.section_fit import best_fit
 from geometry.types import Bools, Floats, Ints, Unit
 
 _GAUGE = 0.05  # of the chord: this far inside either edge its thickness is taken
+_AROUND = 8  # circles before and behind the one whose thickness is asked for
 _MISSED_MM = 0.1  # a circle farther from where it was asked for is not the one
 
 
@@ -156,7 +158,11 @@ def define(nominal_mm: Floats, side: Ints, settings: SectionSettings) -> Definit
     nose = len(nominal_mm) // 2
     le, te = edge(nominal_mm, nose), edge(nominal_mm, 0)
     thick = _thick(nominal_mm, le, te, camber_line(nominal_mm, nose), settings)
-    shapes = {**_chords(nominal_mm, le, te), **_edges(nominal_mm, le, te, settings), **_thicknesses(thick)}
+    shapes = {
+        **_chords(nominal_mm, le, te),
+        **_edges(nominal_mm, le, te, settings),
+        **_thicknesses(thick, settings),
+    }
     shapes["max_camber_mm"] = lambda d: max_camber(d.curve_mm, camber_line(d.curve_mm, nose), d.nose_tail)
     drawn = Drawn(curve_mm=nominal_mm, le=le, te=te)
     own = {name: estimate.value for name, estimate in _estimates(drawn, shapes, shapes).items()}
@@ -202,18 +208,31 @@ def _thick(
         pairs[f"{name}_thickness_mm"] = gauge(camber, from_mm, along, _GAUGE * line.length.value)
         for distance in settings.edge_distances_mm:
             if float(np.abs(place - distance).min()) <= _MISSED_MM:
-                pairs[f"{name}_thickness_at_{distance:g}_mm"] = gauge(camber, from_mm, along, distance)
+                pairs[f"{name}_thickness_at_{distance:g}_mm"] = gauge(
+                    camber, from_mm, along, distance, _AROUND
+                )
     return pairs
 
 
-def _thicknesses(thick: Mapping[str, Pair]) -> dict[str, Shape]:
+def _thicknesses(thick: Mapping[str, Pair], settings: SectionSettings) -> dict[str, Shape]:
     shapes: dict[str, Shape] = {name: partial(_thickness, pair=pair) for name, pair in thick.items()}
+    for end, distance in product(("le", "te"), settings.edge_distances_mm):
+        name = f"{end}_thickness_at_{distance:g}_mm"
+        if name in thick:
+            shapes[name] = partial(_thickness_at, pair=thick[name], end=end, distance_mm=distance)
     largest = thick["max_thickness_mm"]
     return {**shapes, "max_thickness_position_mm": lambda d: thickest_at(d.curve_mm, largest, d.nose_tail)}
 
 
 def _thickness(drawn: Drawn, pair: Pair) -> Estimate:
     return thickness(drawn.curve_mm, pair)
+
+
+def _thickness_at(drawn: Drawn, pair: Pair, end: str, distance_mm: float) -> Estimate:
+    line = drawn.caliper.line
+    if end == "le":
+        return thickness_at(drawn.curve_mm, pair, (line.nose_mm, line.nose_growth), line.along, distance_mm)
+    return thickness_at(drawn.curve_mm, pair, (line.tail_mm, line.tail_growth), -line.along, distance_mm)
 
 
 def _chords(nominal_mm: Floats, le: Edge, te: Edge) -> dict[str, Shape]:

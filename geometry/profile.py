@@ -22,9 +22,12 @@ from geometry.chart import (
     unroll,
 )
 from geometry.errors import CannotMeasure
+from geometry.kernels.profile import cubic_weights, sort_by_height
 from geometry.kernels.profile_spline import SplineFit
 from geometry.nominal import Nominal
 from geometry.types import Bools, Floats, Ints
+
+_BIN_MM, _MOST_BINS = 0.25, 1 << 16  # of height, in which points are found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +57,8 @@ class Profile:
     gaps: tuple[Gap, ...]
     zones: tuple[ZoneArc, ...]  # of each side
     noise_mm: float  # standard deviation of a typical point about the profile, in the plane
+    band_mm: tuple[float, float]  # the heights between which points took part
+    band_points: int  # how many
     knots: Knots
     fit: SplineFit
     columns: Floats  # (NODES, 6) of the fit's free part at the nodes
@@ -71,6 +76,14 @@ class Profile:
         """Covariance (n, n) of n linear functions (n, NODES) of the nodes' normal displacements."""
         spline = self.knots.weights(gradients, self.z_mm)
         return self.fit.covariance(spline, self.columns.T @ gradients.T)
+
+    def node_sigmas(self) -> Floats:
+        """Standard uncertainty (NODES,) of the displacement of each node."""
+        u = self.knots.u(np.arange(NODES, dtype=np.float64))
+        first = u.astype(np.int64)
+        across = self.knots.across(self.z_mm)
+        variances = self.fit.variances(first, cubic_weights(u, first), across, self.columns.T)
+        return np.sqrt(np.maximum(variances, 0.0))
 
     def pose_gradient(self, gradients: Floats, pivot_mm: Floats) -> Floats:
         """(n, 6): growth of the same functions with a pose twist of the part about `pivot_mm`."""
@@ -93,10 +106,23 @@ class Scan:
     sigma_mm: Floats  # (n,)
     mask: Bools  # (n,) True = damaged
 
+    def between(self, low_mm: float, high_mm: float) -> tuple[Ints, Floats]:
+        """Numbers and heights of the sound points from one height to another, and of some just outside."""
+        order, z_mm, start, low, step = self._upward
+        bins = len(start) - 1
+        first, last = (int(np.clip((z - low) / step, 0.0, bins - 1.0)) for z in (low_mm, high_mm))
+        inside = slice(start[first], start[last + 1])
+        return order[inside], z_mm[inside]
+
     @cached_property
-    def sound_z_mm(self) -> Floats:
-        """Heights (n,) of the sound points, NaN for damaged ones: what each section looks through."""
-        return np.where(self.mask, np.nan, self.points_mm[:, 2])
+    def _upward(self) -> tuple[Ints, Floats, Ints, float, float]:
+        """The sound points sorted into bins of height, their heights, where each bin begins, the first
+        height, the step."""
+        z = np.ascontiguousarray(self.points_mm[:, 2])
+        low, high = float(z.min(initial=0.0)), float(z.max(initial=0.0))
+        step = max(_BIN_MM, (high - low) / _MOST_BINS)
+        order, start = sort_by_height(z, self.mask, low, step, int((high - low) / step) + 1)
+        return order, z[order], start, low, step
 
 
 def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
@@ -104,9 +130,9 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
 
     Raises `CannotMeasure` when too few sound points lie near the plane.
     """
-    z = scan.sound_z_mm
+    near, z = scan.between(float(chart.z_mm[0]), float(chart.z_mm[-1]))
     low, high = band_of(chart, z, settings)
-    inside = np.flatnonzero((z >= low) & (z <= high))
+    inside = near[(z >= low) & (z <= high)]
     if len(inside) < settings.min_points:
         raise CannotMeasure(f"no sound points within {settings.band_mm:g} mm of the plane")
     sound = scan.points_mm.take(inside, axis=0)
@@ -115,13 +141,17 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     if len(band.node) < settings.min_points:
         raise CannotMeasure("no sound points near the nominal section")
     keep, knots, fit = robust_fit(band, chart, (low, high), settings)
-    near = np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0
-    arc = _supporting(chart.arc_at(band.node[near]), keep[near], settings.max_gap_mm)
+    close = np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0
+    arc = _supporting(chart.arc_at(band.node[close]), keep[close], settings.max_gap_mm)
     profile = _profile(chart, motion, knots, fit, float(np.median(band.sigma_mm)))
+    widest = _widest(chart.perimeter_mm, len(arc), settings)
+    used = band.z_mm[keep]
     return replace(
         profile,
-        gaps=find_gaps(chart, arc, settings.max_gap_mm),
-        zones=cover_zones(chart.curve_mm, chart.side, arc, settings.max_gap_mm),
+        gaps=find_gaps(chart, arc, widest),
+        zones=cover_zones(chart.curve_mm, chart.side, arc, widest),
+        band_mm=(float(used.min()), float(used.max())),
+        band_points=len(used),
     )
 
 
@@ -144,10 +174,22 @@ def _profile(chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, sigma_m
         gaps=(),
         zones=(),
         noise_mm=noise_mm,
+        band_mm=(chart.section_z_mm, chart.section_z_mm),
+        band_points=0,
         knots=knots,
         fit=fit,
         columns=columns,
     )
+
+
+def _widest(perimeter_mm: float, count: int, settings: SectionSettings) -> float:
+    """The widest arc without a point that is no gap, of a section on which `count` points lie.
+
+    Of points that fall at random one section in a thousand leaves a wider one: mean distance times
+    log(count) + 7.
+    """
+    chance = perimeter_mm / max(count, 1) * (np.log(max(count, 1)) + 7.0)
+    return float(min(settings.max_gap_mm, max(settings.gap_share * perimeter_mm, chance)))
 
 
 def _supporting(arc_mm: Floats, keep: Bools, width_mm: float) -> Floats:

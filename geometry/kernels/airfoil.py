@@ -1,4 +1,6 @@
-"""All-pairs searches on one closed section curve."""
+"""Normals, sums and all-pairs searches on one closed section curve."""
+
+import math
 
 import numpy as np
 from numba import njit
@@ -39,3 +41,44 @@ def inscribed_circles(points_mm: Floats, normals: Floats, at: Ints, against: Int
                 if r < radius[n]:
                     radius[n], contact[n] = r, j
     return radius, contact
+
+
+@njit(cache=True, nogil=True)
+def closed_normals(curve_mm: Floats) -> Floats:
+    """Unit outward normals (m, 2) of a closed counter-clockwise curve, from each node's neighbours."""
+    m = len(curve_mm)
+    out = np.empty((m, 2))
+    for i in range(m):
+        before, after = (i if i > 0 else m) - 1, i + 1 if i + 1 < m else 0
+        x = curve_mm[after, 0] - curve_mm[before, 0]
+        y = curve_mm[after, 1] - curve_mm[before, 1]
+        length = math.sqrt(x * x + y * y)
+        out[i, 0], out[i, 1] = y / length, -x / length
+    return out
+
+
+@njit(cache=True, nogil=True)
+def closed_steps(curve_mm: Floats) -> Floats:
+    """Length (m,) from each node of a closed curve to the next."""
+    m = len(curve_mm)
+    out = np.empty(m)
+    for i in range(m):
+        after = i + 1 if i + 1 < m else 0
+        x, y = curve_mm[after, 0] - curve_mm[i, 0], curve_mm[after, 1] - curve_mm[i, 1]
+        out[i] = math.sqrt(x * x + y * y)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def area_moments(curve_mm: Floats) -> tuple[float, float, float]:
+    """Area of a closed counter-clockwise polygon and its first moments x, y, all about node 0."""
+    area = x = y = 0.0
+    ox, oy = curve_mm[0]
+    for i in range(1, len(curve_mm) - 1):
+        ax, ay = curve_mm[i, 0] - ox, curve_mm[i, 1] - oy
+        bx, by = curve_mm[i + 1, 0] - ox, curve_mm[i + 1, 1] - oy
+        cross = ax * by - bx * ay
+        area += 0.5 * cross
+        x += cross * (ax + bx) / 6.0
+        y += cross * (ay + by) / 6.0
+    return area, x, y

@@ -19,8 +19,9 @@ def _wrap(j: int, m: int) -> int:
 @njit(cache=True, nogil=True)
 def _node(curves: Floats, three: int, up: float, j: int) -> tuple[float, float]:
     """Node `j` of the curve at the fraction `up` of the interval `three`: a parabola in height."""
-    c = curves[three, j]
-    return c[0] + up * (c[2] + up * c[4]), c[1] + up * (c[3] + up * c[5])
+    x = curves[three, j, 0] + up * (curves[three, j, 2] + up * curves[three, j, 4])
+    y = curves[three, j, 1] + up * (curves[three, j, 3] + up * curves[three, j, 5])
+    return x, y
 
 
 @njit(cache=True, nogil=True)
@@ -83,33 +84,65 @@ def _foot(
     distance = math.sqrt(best)
     if (x - fx) * nx + (y - fy) * ny < 0.0:
         distance = -distance
-    return foot % m, distance, nx, ny
+    return foot if foot >= 0.0 else foot + m, distance, nx, ny
+
+
+@njit(cache=True, nogil=True)
+def _interval(z_mm: Floats, z: float) -> tuple[int, float]:
+    """The interval between the even ones of `z_mm` that holds a height or is next to it; the fraction."""
+    three = 0
+    while three < len(z_mm) // 2 - 1 and z >= z_mm[2 * three + 2]:
+        three += 1
+    return three, (z - z_mm[2 * three]) / (z_mm[2 * three + 2] - z_mm[2 * three])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _nearest(
+    curves: Floats,
+    three: int,
+    up: float,
+    x: float,
+    y: float,
+    seeds: Ints,
+    across_mm: Floats,
+    corner_mm: Floats,
+    cell_mm: float,
+) -> int:
+    """The nearest node of the curve at the fraction `up` of the interval `three`."""
+    cx = min(max(int((x - corner_mm[0]) / cell_mm), 0), seeds.shape[0] - 1)
+    cy = min(max(int((y - corner_mm[1]) / cell_mm), 0), seeds.shape[1] - 1)
+    j, best = _descend(curves, three, up, x, y, seeds[cx, cy, 0])
+    if seeds[cx, cy, 1] >= 0 and 16.0 * best > across_mm[j] ** 2:
+        k, other = _descend(curves, three, up, x, y, seeds[cx, cy, 1])
+        if other < best:
+            j = k
+    return j
 
 
 @njit(cache=True, nogil=True)
 def project(
-    points_mm: Floats, z_mm: Floats, curves: Floats, seeds: Ints, corner_mm: Floats, cell_mm: float
+    points_mm: Floats,
+    z_mm: Floats,
+    curves: Floats,
+    seeds: Ints,
+    across_mm: Floats,
+    corner_mm: Floats,
+    cell_mm: float,
 ) -> Floats:
     """(n, 4) of every point: node coordinate in [0, m), signed in-plane distance, outward normal x, y.
 
     `curves` (k, m, 6) are counter-clockwise curves whose nodes correspond, one for each interval of height
     between the even ones of `z_mm` (2 k + 1,): x, y, their slope and their bend over the interval.
     `seeds` (nx, ny, 2) name for each cell a start node and, where the other side of the airfoil may be as
-    near, one there, else -1.
+    near, one there, else -1. `across_mm` (m,): how far the other side is from each node; it is not looked
+    at for a point within a quarter of that.
     """
     out = np.empty((len(points_mm), 4))
     for i in range(len(points_mm)):
-        x, y, z = points_mm[i]
-        three = min(max(np.searchsorted(z_mm, z, side="right") - 1, 0), len(z_mm) - 3) // 2
-        up = (z - z_mm[2 * three]) / (z_mm[2 * three + 2] - z_mm[2 * three])
-        cx = min(max(int((x - corner_mm[0]) / cell_mm), 0), seeds.shape[0] - 1)
-        cy = min(max(int((y - corner_mm[1]) / cell_mm), 0), seeds.shape[1] - 1)
-        j, best = _descend(curves, three, up, x, y, seeds[cx, cy, 0])
-        if seeds[cx, cy, 1] >= 0:
-            k, other = _descend(curves, three, up, x, y, seeds[cx, cy, 1])
-            if other < best:
-                j = k
-        out[i] = _foot(curves, three, up, x, y, j)
+        x, y = points_mm[i, 0], points_mm[i, 1]
+        three, up = _interval(z_mm, points_mm[i, 2])
+        j = _nearest(curves, three, up, x, y, seeds, across_mm, corner_mm, cell_mm)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = _foot(curves, three, up, x, y, j)
     return out
 
 
@@ -133,6 +166,13 @@ def nearest_nodes(points_mm: Floats, curve_mm: Floats) -> Ints:
 
 
 @njit(cache=True, nogil=True)
+def _steep(j: int, three: int, up: float, growth: Floats, trusted: Bools) -> float:
+    """Outward growth of the surface with height about node `j`; NaN where its parabola is not trusted."""
+    near = 2 * three + (0 if up < 0.25 else (1 if up < 0.75 else 2))
+    return growth[near, j] if trusted[three, j] else math.nan
+
+
+@njit(cache=True, nogil=True)
 def steepness(node: Floats, z: Floats, z_mm: Floats, growth: Floats, trusted: Bools) -> Floats:
     """Outward growth (n,) of a surface with height at the nearest curve of `project`; NaN where not trusted.
 
@@ -140,13 +180,21 @@ def steepness(node: Floats, z: Floats, z_mm: Floats, growth: Floats, trusted: Bo
     """
     out = np.empty(len(node))
     for i in range(len(node)):
-        three = min(max(np.searchsorted(z_mm, z[i], side="right") - 1, 0), len(z_mm) - 3) // 2
-        layer = 2 * three
-        up = (z[i] - z_mm[layer]) / (z_mm[layer + 2] - z_mm[layer])
-        j = int(node[i])
-        near = layer + (0 if up < 0.25 else (1 if up < 0.75 else 2))
-        out[i] = growth[near, j] if trusted[three, j] else math.nan
+        three, up = _interval(z_mm, z[i])
+        out[i] = _steep(int(node[i]), three, up, growth, trusted)
     return out
+
+
+@njit(cache=True, nogil=True)
+def _undone(
+    x: float, y: float, height: float, pivot_mm: Floats, rest: Floats, per_mm: Floats
+) -> tuple[float, float]:
+    """A place so high over the section taken back by a motion."""
+    x -= pivot_mm[0] + rest[0] + per_mm[0] * height
+    y -= pivot_mm[1] + rest[1] + per_mm[1] * height
+    turn = rest[2] + per_mm[2] * height
+    c, s = math.cos(turn), math.sin(turn)
+    return c * x + s * y + pivot_mm[0], c * y - s * x + pivot_mm[1]
 
 
 @njit(cache=True, nogil=True)
@@ -154,14 +202,51 @@ def undo_motion(points_mm: Floats, pivot_mm: Floats, z_mm: float, rest: Floats, 
     """Points (n, 3) taken back by a motion (x, y, turn) `rest` at `z_mm` that grows `per_mm` of height."""
     out = np.empty_like(points_mm)
     for i in range(len(points_mm)):
-        height = points_mm[i, 2] - z_mm
-        x = points_mm[i, 0] - pivot_mm[0] - rest[0] - per_mm[0] * height
-        y = points_mm[i, 1] - pivot_mm[1] - rest[1] - per_mm[1] * height
-        turn = rest[2] + per_mm[2] * height
-        c, s = math.cos(turn), math.sin(turn)
-        out[i, 0], out[i, 1] = c * x + s * y + pivot_mm[0], c * y - s * x + pivot_mm[1]
-        out[i, 2] = points_mm[i, 2]
+        x, y, z = points_mm[i, 0], points_mm[i, 1], points_mm[i, 2]
+        out[i, 0], out[i, 1] = _undone(x, y, z - z_mm, pivot_mm, rest, per_mm)
+        out[i, 2] = z
     return out
+
+
+@njit(cache=True, nogil=True)
+def lay(
+    points_mm: Floats,
+    motion: tuple[Floats, float, Floats, Floats],
+    surface: tuple[Floats, Floats, Floats, Bools],
+    grid: tuple[Ints, Floats, Floats, float],
+    limits: tuple[float, float],
+) -> tuple[Ints, Floats, Floats]:
+    """The points that belong to a profile, as what `band_misfit` takes of them.
+
+    `motion` as `undo_motion` takes it, `surface` (`z_mm`, `curves`, `growth`, `trusted`) and `grid` (`seeds`,
+    `across_mm`, `corner_mm`, `cell_mm`) as `project` and `steepness` do. Points belong that lie within
+    `limits` of the curve, where it is no steeper. Returns their numbers (k,), (k, 3) node coordinate,
+    height, and how much longer a distance in the plane is than along the surface normal, and (k, 6)
+    signed distance, arm x, y, outward normal x, y and height over the section.
+    """
+    pivot_mm, section_mm, rest, per_mm = motion
+    z_mm, curves, growth, trusted = surface
+    seeds, across_mm, corner_mm, cell_mm = grid
+    capture_mm, steepest = limits
+    number, place = np.empty(len(points_mm), np.int64), np.empty((len(points_mm), 3))
+    rows = np.empty((len(points_mm), 6))
+    used = 0
+    for i in range(len(points_mm)):
+        z = points_mm[i, 2]
+        height = z - section_mm
+        x, y = _undone(points_mm[i, 0], points_mm[i, 1], height, pivot_mm, rest, per_mm)
+        three, up = _interval(z_mm, z)
+        j = _nearest(curves, three, up, x, y, seeds, across_mm, corner_mm, cell_mm)
+        foot, distance, nx, ny = _foot(curves, three, up, x, y, j)
+        steep = _steep(int(foot), three, up, growth, trusted)
+        if abs(distance) <= capture_mm and abs(steep) <= steepest:
+            number[used] = i
+            place[used, 0], place[used, 1], place[used, 2] = foot, z, math.sqrt(1.0 + steep * steep)
+            rows[used, 0], rows[used, 3], rows[used, 4] = distance, nx, ny
+            rows[used, 1], rows[used, 2] = x - pivot_mm[0], y - pivot_mm[1]
+            rows[used, 5] = height
+            used += 1
+    return number[:used], place[:used], rows[:used]
 
 
 @njit(cache=True, nogil=True)
@@ -239,22 +324,31 @@ def band_inverse(factor: Floats) -> Floats:
     """The entries of `(L L')^-1` inside the band of `L`, in the same lower band storage (w + 1, n).
 
     `factor[d, j]` is L[j + d, j], as `scipy.linalg.cholesky_banded(lower=True)` gives it.
-    Source: Takahashi, Fagan and Chin 1973, the recursion from the last column to the first.
+    Source: Takahashi, Fagan and Chin 1973, the recursion from the last column to the first. The part of
+    the inverse that a column needs is kept square, row k in place k modulo w.
     """
     width, n = factor.shape
-    inverse = np.zeros((width, n))
+    ring = max(width - 1, 1)
+    lower = np.ascontiguousarray(factor.T)
+    inverse = np.zeros((n, width))
+    near, pull = np.zeros((ring, ring)), np.empty(ring)
     for j in range(n - 1, -1, -1):
-        reach = min(width - 1, n - 1 - j)
+        reach, own = min(width - 1, n - 1 - j), 1.0 / lower[j, 0]
+        pull[:] = 0.0
+        for d in range(1, reach + 1):
+            row, f = near[(j + d) % ring], lower[j, d]
+            for k in range(ring):
+                pull[k] += f * row[k]
+        total = 0.0
+        for d in range(1, reach + 1):
+            inverse[j, d] = -own * pull[(j + d) % ring]
+            total += lower[j, d] * inverse[j, d]
+        inverse[j, 0] = own * (own - total)
+        here = j % ring
         for d in range(reach, -1, -1):
-            i = j + d
-            total = 0.0
-            for k in range(j + 1, i + 1):
-                total += factor[k - j, j] * inverse[i - k, k]
-            for k in range(max(i, j) + 1, j + reach + 1):
-                total += factor[k - j, j] * inverse[k - i, i]
-            own = 1.0 / factor[0, j] if d == 0 else 0.0
-            inverse[d, j] = (own - total) / factor[0, j]
-    return inverse
+            there = (j + d) % ring
+            near[here, there] = near[there, here] = inverse[j, d]
+    return inverse.T
 
 
 @njit(cache=True, nogil=True)
@@ -333,3 +427,44 @@ def band_bins(
                 sums[used, c] = sums[b, c] if c == 2 else sums[b, c] / total
             used += 1
     return sums[:used].copy()
+
+
+@njit(cache=True, nogil=True)
+def sort_by_height(z_mm: Floats, mask: Bools, low_mm: float, step_mm: float, bins: int) -> tuple[Ints, Ints]:
+    """The numbers of the points that `mask` does not mark, bin by bin upward, and where each bin begins.
+
+    Bin b holds the heights from `low_mm` + b `step_mm` on; in a bin the points keep their order. Returns
+    (k,) and (bins + 1,).
+    """
+    start = np.zeros(bins + 1, np.int64)
+    for i in range(len(z_mm)):
+        if not mask[i]:
+            start[min(int((z_mm[i] - low_mm) / step_mm), bins - 1) + 1] += 1
+    for b in range(bins):
+        start[b + 1] += start[b]
+    order, place = np.empty(start[bins], np.int64), start.copy()
+    for i in range(len(z_mm)):
+        if not mask[i]:
+            b = min(int((z_mm[i] - low_mm) / step_mm), bins - 1)
+            order[place[b]] = i
+            place[b] += 1
+    return order, start
+
+
+@njit(cache=True, nogil=True)
+def bend_times(along: Floats, values: Floats) -> Floats:
+    """Symmetric periodic matrices (g, p, 4), [i, d] against i + d, none at 3, times (p, k): (g, p, k)."""
+    groups, p, _ = along.shape
+    out = np.zeros((groups, p, values.shape[1]))
+    for g in range(groups):
+        for i in range(p):
+            for d in range(3):
+                w = along[g, i, d]
+                if w == 0.0:
+                    continue
+                j = _wrap(i + d, p)
+                for k in range(values.shape[1]):
+                    out[g, i, k] += w * values[j, k]
+                    if d > 0:
+                        out[g, j, k] += w * values[i, k]
+    return out

@@ -5,11 +5,13 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 
-from geometry.kernels.profile import band_inverse, tensor_sums, tensor_values
+from geometry.kernels.profile import band_inverse, bend_times, tensor_sums, tensor_values
 from geometry.types import Floats, Ints
 
-_OVERSTEP = 1.6  # the update creeps towards its fixed point from one side
+_BALANCED = 0.25  # dimensions: twice the gain in log likelihood by an e-fold of strength
+_WEAKER, _STRONGER = np.log(1e4), np.log(2e2)  # reach of the search for the strengths
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,46 +69,49 @@ class Penalty:
     """
 
     layout: Stencil
-    along: Floats  # (groups, p, p)
+    along: Floats  # (groups, p, 4): [i, d] against i + d; no bend reaches farther than 2
     share: Floats  # (p,)
     across: Floats  # (q, q)
+    nu: Floats  # (q,) eigenvalues of `across`
 
     def matrix(self, strength: Floats) -> Floats:
         """The sum of the matrices, each times its strength, as a stencil matrix."""
-        p, q = self.layout.p, self.layout.q
-        i, d = np.ix_(np.arange(p), np.arange(4))
         total = np.tensordot(strength[:-1], self.along, 1)
-        out = total[i, (i + d) % p][:, :, None, None] * np.eye(q)
+        out: Floats = total[:, :, None, None] * np.eye(self.layout.q)
         out[:, 0] += strength[-1] * self.share[:, None, None] * self.across
         return out
 
     def times(self, values: Floats) -> Floats:
         """Every matrix times values (p, q, n): (matrices, p, q, n)."""
-        along = np.tensordot(self.along, values, 1)
-        across = self.share[:, None, None] * (self.across @ values)
-        return np.concatenate([along, across[None]])
+        along = bend_times(self.along, np.ascontiguousarray(values).reshape(len(values), -1))
+        share = self.share[:, None, None] * (self.across @ values)
+        return np.concatenate([along.reshape(-1, *values.shape), share[None]])
 
     def traces(self, inverse: Floats) -> Floats:
         """Trace of every matrix times an inverse, given where stencil matrices have entries."""
-        p = self.layout.p
-        i, d = np.ix_(np.arange(p), np.arange(4))
-        blocks = np.trace(inverse, axis1=2, axis2=3) * np.array([1.0, 2.0, 2.0, 2.0])
-        along = (self.along[:, i, (i + d) % p] * blocks).sum(axis=(1, 2))
-        across = float((self.share @ inverse[:, 0].reshape(p, -1)) @ self.across.ravel())
-        return np.append(along, across)
+        blocks = np.trace(inverse, axis1=2, axis2=3) * _TWICE
+        across = float((self.share @ inverse[:, 0].reshape(self.layout.p, -1)) @ self.across.ravel())
+        return np.append((self.along * blocks).sum(axis=(1, 2)), across)
 
     def effective(self, strength: Floats) -> Floats:
-        """Strength times trace(S^- S_j) for each matrix S_j of the sum S: the dimensions it penalises."""
-        scale = 1.0 / np.sqrt(self.share)
-        mu, vectors = np.linalg.eigh(scale[:, None] * np.tensordot(strength[:-1], self.along, 1) * scale)
-        mu = np.where(mu > 1e-9 * mu[-1], mu, 0.0)
-        nu = strength[-1] * np.linalg.eigvalsh(self.across)
-        nu[:2] = 0.0  # straight lines bend nowhere
-        total = mu[:, None] + nu
-        inverse = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0.0)
-        scaled = scale[:, None] * vectors
-        parts = (scaled * (self.along @ scaled)).sum(axis=1) @ inverse.sum(axis=1)
-        return np.append(strength[:-1] * parts, (inverse * nu).sum())
+        """Strength times trace(S^- S_j) for each matrix S_j of the sum S: the dimensions it penalises.
+
+        Seen in the eigenvectors of `across`, S falls into q matrices along, the first two of which bend
+        with the arc only: constants are all that these leave free, and one coefficient is held for them.
+        """
+        layout, nu = stencil(self.layout.p, 1), strength[-1] * self.nu
+        along = np.tensordot(strength[:-1], self.along, 1)
+        blocks = np.repeat(along[None], len(nu), axis=0)
+        blocks[:, :, 0] += nu[:, None] * self.share
+        blocks[:2, 0, 0] += along[:, 0].max()
+        bands = np.hstack([layout.band(block[:, :, None, None]) for block in blocks])
+        inverse = band_inverse(cholesky_banded(bands, lower=True, check_finite=False))
+        inside = np.stack([layout.inside(each)[:, :, 0, 0] for each in np.split(inverse, len(nu), axis=1)])
+        parts = (self.along * (inside.sum(axis=0) * _TWICE)).sum(axis=(1, 2))
+        return np.append(strength[:-1] * parts, float((nu @ inside[:, :, 0]) @ self.share))
+
+
+_TWICE = np.array([1.0, 2.0, 2.0, 2.0])  # what is off the diagonal is there twice
 
 
 def curvature_penalty(centre_mm: Floats, perimeter_mm: float, group: Ints, q: int, open_mm: float) -> Penalty:
@@ -124,13 +129,15 @@ def curvature_penalty(centre_mm: Floats, perimeter_mm: float, group: Ints, q: in
     rows[here, (here + 1) % p] = 1.0 / (step * share)
     rows[here, here] = -(rows[here, here - 1] + rows[here, (here + 1) % p])
     second = np.diff(np.eye(q), 2, axis=0) / open_mm**2
+    weights = open_mm * share * (group == np.arange(int(group.max()) + 1)[:, None])
+    i, d = np.ix_(here, np.arange(4))
+    across = open_mm * second.T @ second
     return Penalty(
         layout=stencil(p, q),
-        along=np.stack(
-            [open_mm * rows.T @ (rows * (share * (group == g))[:, None]) for g in range(int(group.max()) + 1)]
-        ),
+        along=np.stack([(rows.T @ (rows * weight[:, None]))[i, (i + d) % p] for weight in weights]),
         share=share,
-        across=open_mm * second.T @ second,
+        across=across,
+        nu=np.concatenate([[0.0, 0.0], np.linalg.eigvalsh(across)[2:]]),
     )
 
 
@@ -175,7 +182,9 @@ class SplineFit:
     taken: Floats  # effective dimensions that each penalty takes away
     factor: Floats  # band Cholesky factor
     cross: Floats  # (p q, e), band order; more columns than `free` once functions are held
+    solved: Floats  # (p q, e): the inverse of the spline's matrix times `cross`
     schur: Floats  # (e, e)
+    inverse: Floats  # (p, 4, q, q) of the spline's matrix, where a stencil has entries
 
     def values(self, u: Floats, v: Floats, columns: Floats) -> Floats:
         """The fitted function at (u, v)."""
@@ -184,10 +193,27 @@ class SplineFit:
     def covariance(self, spline: Floats, free: Floats) -> Floats:
         """Covariance (n, n) of n linear functions: weights `spline` (p, q, n) and `free` (e, n)."""
         folded = self.layout.fold(spline)
-        solved = cho_solve_banded((self.factor, True), folded, check_finite=False)
-        free = np.vstack([free, np.zeros((self.cross.shape[1] - len(free), free.shape[1]))])
-        rest = free - self.cross.T @ solved
-        return self.scale * (folded.T @ solved + rest.T @ np.linalg.solve(self.schur, rest))
+        half = dtbtrs(self.factor, folded, uplo="L")[0]
+        rest = self._padded(free) - self.solved.T @ folded
+        return self.scale * (half.T @ half + rest.T @ np.linalg.solve(self.schur, rest))
+
+    def variances(self, first: Ints, along: Floats, across: Floats, free: Floats) -> Floats:
+        """Variance (n,) of n values of the function, at less cost: `along` (n, 4) weights the rows of
+        coefficients from `first` (n,) on, `across` (q,) those in a row, `free` (e, n) the free columns."""
+        row = (first[:, None] + np.arange(4)) % self.layout.p
+        inside = (self.inverse @ across) @ across
+        own = np.zeros(len(first))
+        for k in range(4):
+            for d in range(4 - k):
+                own += _TWICE[d] * along[:, k] * along[:, k + d] * inside[row[:, k], d]
+        bent = self.layout.unfold(self.solved).transpose(0, 2, 1) @ across
+        rest = self._padded(free) - (bent[row] * along[:, :, None]).sum(axis=1).T
+        variances: Floats = self.scale * (own + (rest * np.linalg.solve(self.schur, rest)).sum(axis=0))
+        return variances
+
+    def _padded(self, free: Floats) -> Floats:
+        """Weights of the free columns, none for the functions held."""
+        return np.vstack([free, np.zeros((self.cross.shape[1] - len(free), free.shape[1]))])
 
     def held(self, weights: Floats, variance: Floats) -> "SplineFit":
         """The fit, told that the functions `weights` (p, q, n) of the spline are 0 with a `variance` (n,).
@@ -196,8 +222,8 @@ class SplineFit:
         measurements join the free columns.
         """
         folded, old = self.layout.fold(weights), self.cross.shape[1]
-        solved = cho_solve_banded((self.factor, True), np.hstack([self.cross, folded]), check_finite=False)
-        cross = np.hstack([self.cross, folded])
+        bent = cho_solve_banded((self.factor, True), folded, check_finite=False)
+        cross, solved = np.hstack([self.cross, folded]), np.hstack([self.solved, bent])
         schur = -cross.T @ solved
         schur[:old, :old] = self.schur
         schur[old:, old:] -= np.diag(variance / self.scale)
@@ -206,7 +232,14 @@ class SplineFit:
         step = np.linalg.solve(schur, wrong)
         after = self.layout.unfold((before - solved @ step)[:, None])[:, :, 0]
         free = self.free + step[: len(self.free)]
-        return replace(self, coefficients=np.ascontiguousarray(after), free=free, cross=cross, schur=schur)
+        return replace(
+            self,
+            coefficients=np.ascontiguousarray(after),
+            free=free,
+            cross=cross,
+            solved=solved,
+            schur=schur,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -262,7 +295,9 @@ def solve(sums: Sums, penalty: Penalty, strength: Floats) -> SplineFit:
         taken=taken,
         factor=found.factor,
         cross=found.cross,
+        solved=found.solved[:, 1:],
         schur=found.schur,
+        inverse=inverse,
     )
 
 
@@ -276,14 +311,36 @@ def _correction(penalty: Penalty, bent: Floats, schur: Floats) -> Floats:
 def fit_spline(sums: Sums, penalty: Penalty, start: Floats, rounds: int = 12) -> SplineFit:
     """The fit at the strengths of restricted maximum likelihood, from the strengths `start`.
 
+    A strength is in balance when the dimensions that it is left to penalise equal the bending found, in
+    units of the noise: then the likelihood no longer grows with it. The logarithms of their ratios are
+    brought to zero by Broyden's method, from a guess of its slopes; a form without any bending ends at
+    the strongest that is tried.
     Source: the generalised Fellner-Schall update, Wood and Fasiolo 2017, equation 4.
     """
+    low, high = np.log(start) - _WEAKER, np.log(start) + _STRONGER
+    log, slopes = np.log(start), _guess(len(start))
+    last: tuple[Floats, Floats] | None = None
     fit = solve(sums, penalty, start)
     for _ in range(rounds):
-        gain = np.clip(penalty.effective(fit.strength) - fit.taken, 1e-6, None)
-        step = np.clip(np.log(fit.scale * gain / np.maximum(fit.bending, 1e-300)), -4.0, 4.0)
-        strength = np.clip(fit.strength * np.exp(_OVERSTEP * step), start * 1e-6, start * 1e9)
-        fit = solve(sums, penalty, strength)
-        if np.abs(step).max() < 0.3:
+        owed = np.maximum(penalty.effective(fit.strength) - fit.taken, 1e-6)
+        found = np.maximum(fit.bending / fit.scale, 1e-6)
+        ratio = np.log(owed / found)
+        free = np.where(ratio > 0.0, log < high, log > low)
+        if not (np.abs(owed - found)[free] > _BALANCED).any():
             break
+        if last is not None:
+            before, moved = last
+            slopes = slopes + np.outer(ratio - before - slopes @ moved, moved) / float(moved @ moved)
+        step = -np.linalg.solve(slopes, ratio)
+        if not (step @ ratio > 0.0 and np.abs(step).max() <= 4.0 * np.abs(ratio).max()):
+            slopes = _guess(len(start))
+            step = -np.linalg.solve(slopes, ratio)
+        after = np.clip(log + np.clip(step, -3.0, 3.0), low, high)
+        last, log = (ratio, after - log), after
+        fit = solve(sums, penalty, np.exp(log))
     return fit
+
+
+def _guess(count: int) -> Floats:
+    """How the logarithms of the ratios fall with those of the strengths, as blades have it; slowly across."""
+    return np.diag(np.append(np.full(count - 1, -0.8), -0.3))

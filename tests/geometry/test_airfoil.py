@@ -283,7 +283,7 @@ def test_fewer_points_never_measure_more():
                 assert isinstance(new, NotMeasured), name
             elif isinstance(new, Measurand):
                 assert new.sigma > 0.8 * old.sigma, name
-        assert after.covered_fraction <= before.covered_fraction + 1e-9
+        assert after.covered_fraction <= before.covered_fraction + 1e-5  # a micrometre of arc
         before = after
 
 

@@ -20,7 +20,7 @@ from geometry.curve import (
     thickness,
 )
 from geometry.errors import CannotMeasure
-from geometry.kernels.airfoil import farthest_pair, inscribed_circles
+from geometry.kernels.airfoil import closed_normals, closed_steps, farthest_pair, inscribed_circles
 from tests.geometry.airfoils import AnalyticNominal, Blade, DiscAirfoil, random_airfoil
 
 A, B = 20.0, 4.0
@@ -156,6 +156,15 @@ def test_inscribed_circles_equal_their_slow_twin():
         r = np.where(depth > 0.0, (away**2).sum(axis=1) / (2.0 * np.where(depth > 0.0, depth, 1.0)), np.inf)
         assert radius[n] == pytest.approx(r.min(), rel=1e-12)
         assert contact[n] == against[np.argmin(r)]
+
+
+def test_normals_and_steps_equal_their_slow_twins():
+    curve, _ = DiscAirfoil().curve(per_side=50, per_edge=20)
+    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    expected = np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+    assert_allclose(closed_normals(curve), expected, atol=1e-14)
+    steps = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
+    assert_allclose(closed_steps(curve), steps, atol=1e-14)
 
 
 def test_farthest_pair_equals_its_slow_twin():

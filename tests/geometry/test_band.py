@@ -7,7 +7,14 @@ from numpy.testing import assert_allclose
 from geometry.band import band_of
 from geometry.chart import Motion, SectionSettings, curvature, rigid_columns, unroll
 from geometry.curve import centroid
-from geometry.kernels.profile import band_bins, band_misfit, nearest_nodes, steepness, tensor_values
+from geometry.kernels.profile import (
+    band_bins,
+    band_misfit,
+    nearest_nodes,
+    sort_by_height,
+    steepness,
+    tensor_values,
+)
 from geometry.kernels.profile_spline import curvature_penalty, gather, solve, stencil
 from geometry.profile import Scan, reconstruct
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part
@@ -114,6 +121,40 @@ def test_the_sparser_the_scan_the_wider_the_band(spacing_mm, half_mm):
     count = round(24.0 * CHART.perimeter_mm / spacing_mm**2)
     low, high = band_of(CHART, np.random.default_rng(0).uniform(40.5, 64.5, count), SETTINGS)
     assert (low, high) == pytest.approx((52.5 - half_mm, 52.5 + half_mm), abs=0.2)
+
+
+def test_points_are_laid_as_motion_projection_and_steepness_say():
+    """One pass over the points against the three steps that it takes at once."""
+    rng = np.random.default_rng(4)
+    points = Part().scan(rng, 41.0, 64.0, 1.0, 0.3)
+    motion = Motion(
+        pivot_mm=np.array([1.0, -2.0]),
+        z_mm=52.5,
+        rest=np.array([0.2, -0.1, 0.004]),
+        per_mm=np.array([0.01, 0.02, 5e-4]),
+    )
+    number, place, rows = CHART.lay(points, motion, 0.5, 0.04)
+    back = motion.undo(points)
+    foot = CHART.project(back)
+    steep = steepness(foot[:, 0], back[:, 2], CHART.z_mm, CHART.growth_of_nodes, CHART.trusted)
+    near = np.flatnonzero((np.abs(foot[:, 1]) <= 0.5) & (np.abs(steep) <= 0.04))
+    assert 0 < len(near) < len(points)
+    np.testing.assert_array_equal(number, near)
+    longer = np.sqrt(1.0 + steep**2)
+    assert_allclose(place, np.column_stack([foot[:, 0], points[:, 2], longer])[near], atol=1e-12)
+    arm, height = back[:, :2] - motion.pivot_mm, points[:, 2:] - 52.5
+    assert_allclose(rows, np.hstack([foot[:, 1:2], arm, foot[:, 2:], height])[near], atol=1e-12)
+
+
+def test_heights_sorted_into_bins():
+    rng = np.random.default_rng(1)
+    z, mask = rng.uniform(-3.0, 8.0, 500), rng.random(500) < 0.3
+    order, start = sort_by_height(z, mask, -3.0, 0.5, 22)
+    assert sorted(order) == np.flatnonzero(~mask).tolist()
+    for b in range(22):
+        inside = order[start[b] : start[b + 1]]
+        assert (np.diff(inside) > 0).all()
+        assert ((z[inside] >= -3.0 + 0.5 * b) & (z[inside] < -2.5 + 0.5 * b)).all()
 
 
 def test_a_band_ends_where_its_chart_ends():

@@ -17,6 +17,7 @@ Z = 52.5
 NOMINAL, SETTINGS = AnalyticNominal(Blade()), SectionSettings()
 CHART = unroll(NOMINAL, Z, 12.0, SETTINGS)
 SUPPORTS = define(CHART.curve_mm, CHART.side, SETTINGS).supports()
+PARTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4)  # of the perimeter
 WORST_MM = 0.3 * CHART.perimeter_mm
 
 
@@ -27,7 +28,7 @@ def bump(s, z):
 
 @cache
 def scanned():
-    points = Part(deviation=bump).scan(np.random.default_rng(3), 45.0, 60.0, 0.3, 0.012)
+    points = Part(deviation=bump).scan(np.random.default_rng(3), 46.0, 59.0, 0.15, 0.012)
     return points, CHART.arc_at(CHART.project(points)[:, 0])
 
 
@@ -41,14 +42,14 @@ def without(start_mm, width_mm):
     """The scan without the points on an arc, and the nodes well inside that arc."""
     points, arc = scanned()
     gone = (arc - start_mm) % CHART.perimeter_mm < width_mm
-    inside = (CHART.arc_mm[:-1] - start_mm - 0.3) % CHART.perimeter_mm < width_mm - 0.6
+    inside = (CHART.arc_mm[:-1] - start_mm - 0.1) % CHART.perimeter_mm < width_mm - 0.2
     return points[~gone], inside
 
 
 def gaps():
     rng = np.random.default_rng(5)
-    anywhere = [(rng.uniform(0.0, CHART.perimeter_mm), part) for part in (0.03, 0.05, 0.1, 0.2, 0.4)]
-    over_the_worst = [(WORST_MM - 0.5 * part * CHART.perimeter_mm, part) for part in (0.03, 0.1, 0.25)]
+    anywhere = [(rng.uniform(0.0, CHART.perimeter_mm), part) for part in PARTS]
+    over_the_worst = [(WORST_MM - 0.5 * part * CHART.perimeter_mm, part) for part in PARTS]
     return anywhere + over_the_worst
 
 
