@@ -190,8 +190,8 @@ def main() -> int:
     failures = 0
     print(f"{asked.count} random poses a row, seed {asked.seed}")
     print(
-        f"  {'blade, scenario':32s} {'accepted':>8s} {'wrong':>6s} {'error mm, median':>17s} {'largest':>8s}"
-        f" {'CPU s':>6s}"
+        f"  {'blade, scenario':32s} {'right':>6s} {'HOLD':>6s} {'wrong':>6s} {'error mm, median':>17s}"
+        f" {'largest':>8s} {'CPU s':>6s}"
     )
     for label, blade in (("tapered", TAPERED), ("near screw", SCREW)):
         for name, make in SCENARIOS.items():
@@ -207,8 +207,8 @@ def show(label: str, found: list[Outcome]) -> int:
     failed = [one for one in found if one.failed]
     errors_mm = [one.error_mm for one in accepted] or [np.nan]
     print(
-        f"  {label:32s} {len(accepted):8d} {len(failed):6d} {np.median(errors_mm):17.4f}"
-        f" {max(errors_mm):8.4f} {np.mean([one.cpu_s for one in found]):6.2f}",
+        f"  {label:32s} {len(accepted) - len(failed):6d} {len(found) - len(accepted):6d} {len(failed):6d}"
+        f" {np.median(errors_mm):17.4f} {max(errors_mm):8.4f} {np.mean([one.cpu_s for one in found]):6.2f}",
         flush=True,
     )
     for one in failed:

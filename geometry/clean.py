@@ -5,23 +5,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.errors import BadInput
-from geometry.kernels.graph import component_sizes, only_mutual
-from geometry.kernels.neighbours import in_cell_order, k_nearest
+from geometry.kernels.graph import component_sizes
+from geometry.kernels.neighbours import sorted_nearest
 from geometry.kernels.quadric import plane_heights
+from geometry.neighbourhood import Neighboured
 from geometry.types import Bools, Cloud, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanSettings:
     neighbours: int = 12
+    kept_neighbours: int = 16  # that later steps find with the cloud
     sparse_ratio: float = 6.0  # of the median distance to neighbours: farther points are not joined
     outlier_sigmas: float = 6.0  # height over the neighbours' plane, in their own scatter and in sigma
     smallest_cluster: int = 30  # points; fewer, apart from everything else, are no surface
     most_points: int = 1_000_000
 
     def __post_init__(self) -> None:
-        if self.neighbours < 6 or self.most_points < 1 or self.smallest_cluster < 1:
-            raise BadInput(f"clean: {self} asks for too few neighbours or points")
+        if not 6 <= self.neighbours <= self.kept_neighbours:
+            raise BadInput(f"clean: {self} asks for too few neighbours")
+        if self.most_points < 1 or self.smallest_cluster < 1:
+            raise BadInput(f"clean: {self} asks for too few points")
         if not (self.sparse_ratio > 1.0 and self.outlier_sigmas > 0.0):
             raise BadInput(f"clean: {self} would take the surface itself")
 
@@ -34,16 +38,24 @@ def clean(cloud: Cloud, settings: CleanSettings = CleanSettings()) -> Cloud:
     agree among themselves: at an edge they do not, so edges stay. A cloud too small to judge is returned
     as it is.
     """
-    if len(cloud) <= 2 * settings.neighbours:
+    if len(cloud) <= 2 * settings.kept_neighbours:
         return cloud
-    cloud = _select(cloud, in_cell_order(cloud.points_mm))
-    nearest, distance_mm = k_nearest(cloud.points_mm, settings.neighbours + 1)
+    order, nearest, distance_mm = sorted_nearest(cloud.points_mm, settings.kept_neighbours + 1)
+    cloud = _select(cloud, order)
     strays = _strays(nearest, distance_mm, settings)
-    return _thin(_select(cloud, ~(strays | _outliers(cloud, nearest, settings))), settings.most_points)
+    return _thin(_without(cloud, strays | _outliers(cloud, nearest, settings), nearest), settings.most_points)
 
 
 def _select(cloud: Cloud, kept: Bools | Ints) -> Cloud:
     return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
+
+
+def _without(cloud: Cloud, gone: Bools, nearest: Ints) -> Neighboured:
+    """The cloud without the points that are gone, and the neighbours of the rest."""
+    if gone.any():
+        place = np.where(gone, -1, np.cumsum(~gone) - 1)
+        cloud, nearest = _select(cloud, ~gone), place[nearest[~gone]]
+    return Neighboured(points_mm=cloud.points_mm, sigma_mm=cloud.sigma_mm, view=cloud.view, nearest=nearest)
 
 
 def _strays(nearest: Ints, distance_mm: Floats, settings: CleanSettings) -> Bools:
@@ -52,14 +64,14 @@ def _strays(nearest: Ints, distance_mm: Floats, settings: CleanSettings) -> Bool
     Two points are joined if each is among the nearest of the other: a flying pixel has neighbours on the
     surface, but these have nearer ones of their own.
     """
-    reach_mm = settings.sparse_ratio * float(np.median(distance_mm[:, 1:].mean(axis=1)))
-    joined = np.where(distance_mm <= reach_mm, only_mutual(nearest), -1)
-    return component_sizes(joined) < settings.smallest_cluster
+    width = settings.neighbours + 1
+    reach_mm = settings.sparse_ratio * float(np.median(distance_mm[:, 1:width].mean(axis=1)))
+    return component_sizes(nearest, distance_mm, width, reach_mm) < settings.smallest_cluster
 
 
 def _outliers(cloud: Cloud, nearest: Ints, settings: CleanSettings) -> Bools:
     """Points off the plane of neighbours that agree among themselves."""
-    height_mm, scatter_mm = plane_heights(cloud.points_mm, nearest)
+    height_mm, scatter_mm = plane_heights(cloud.points_mm, nearest, settings.neighbours + 1)
     limit_mm = settings.outlier_sigmas * np.maximum(scatter_mm, cloud.sigma_mm)
     return np.asarray(np.abs(height_mm) > limit_mm)
 

@@ -20,7 +20,6 @@ _STEPS = 30
 _CLOSE_MM = 1e-6  # of the surface, between two steps on six points
 _LOCAL_STEPS = 8
 _TUKEY = 4.685
-_RIM_MM = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +96,7 @@ def _register_bands(
     turns = robust.iterations
     for _ in range(settings.register.rounds):
         here = replace(start, T_nominal_scan=fit.T_nominal_scan)
-        sound = ~mask_damage(cloud, here, nominal, settings.register) & _within_scan(nominal, fit.found)
+        sound = ~mask_damage(cloud, here, nominal, settings.register) & felt(nominal, fit.found)
         _check_counts(fit.found.points_mm[sound, 2], bands, settings)
         kept = sound & _inside(fit.found.points_mm[:, 2], bands, 0.0)
         fit = fit_kept(cloud.points_mm, fit, kept, nominal)
@@ -136,15 +135,6 @@ def _alignment(
         iterations=fit.iterations,
         converged=fit.converged,
     )
-
-
-def _within_scan(nominal: Nominal, found: Closest) -> Bools:
-    """Points (n,) whose foot says something of the pose: nothing at the bottom end, nor on its very rim.
-
-    There the normal looks half down, and a few points that noise pushed below it would hold the height.
-    """
-    bottom_mm = float(nominal.mesh.vertices_mm[:, 2].min())
-    return felt(nominal, found) & (found.points_mm[:, 2] > bottom_mm + _RIM_MM)
 
 
 def _check_bands(bands: Sequence[tuple[float, float]]) -> None:

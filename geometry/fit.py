@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geometry.ends import on_rim
 from geometry.mask import robust_sigma
 from geometry.nominal import Closest, Nominal
 from geometry.transforms import apply, exp
@@ -37,8 +38,10 @@ class Step:
 
 
 def felt(nominal: Nominal, found: Closest) -> Bools:
-    """Points (n,) whose foot says something of the pose: not those at the root end, where scans end."""
-    return np.asarray(~nominal.end_face[found.face])
+    """Points (n,) whose foot says something of the pose: none at the bottom end, where scans stop, nor on
+    the rim of an end face: the few points that noise pushed past the end of a scan would hold its height.
+    """
+    return np.asarray(~(nominal.end_face[found.face] | on_rim(nominal, found.points_mm)))
 
 
 def motions(moved_mm: Floats, normals: Floats, pivot_mm: Floats) -> Floats:
@@ -46,18 +49,54 @@ def motions(moved_mm: Floats, normals: Floats, pivot_mm: Floats) -> Floats:
     return np.column_stack([np.cross(moved_mm - pivot_mm, normals), normals])
 
 
-def solve_step(nominal: Nominal, moved_mm: Floats, found: Closest, weights: Floats) -> Step:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """Equations beside those of the points: motion (k, 6) of each for unit twists, how far off, weights."""
+
+    design: Floats
+    off_mm: Floats
+    weights: Floats
+
+
+NO_ROWS = Rows(design=np.zeros((0, 6)), off_mm=np.zeros(0), weights=np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Held:
+    """Heights that a fit keeps beside its points: the ends of a scan, each worth some points."""
+
+    points_mm: Floats  # (k, 3) scan frame
+    heights_mm: Floats  # (k,) of the nominal, where they belong
+    weights: Floats  # (k,)
+
+    def rows(self, T_nominal_scan: Floats, pivot_mm: Floats) -> Rows:
+        moved_mm = apply(T_nominal_scan, self.points_mm)
+        upward = np.tile([0.0, 0.0, 1.0], (len(moved_mm), 1))
+        return Rows(
+            design=motions(moved_mm, upward, pivot_mm),
+            off_mm=moved_mm[:, 2] - self.heights_mm,
+            weights=self.weights,
+        )
+
+
+NOTHING_HELD = Held(points_mm=np.zeros((0, 3)), heights_mm=np.zeros(0), weights=np.zeros(0))
+
+
+def solve_step(
+    nominal: Nominal, moved_mm: Floats, found: Closest, weights: Floats, beside: Rows = NO_ROWS
+) -> Step:
     """The Gauss-Newton step, not along directions whose eigenvalue is below `WEAK` a point.
 
     Rotations are measured by the displacement at the surface's radius of gyration, so that eigenvalues of
     all six directions compare. Degeneracy after Zhang, Kaess and Singh (2016).
     """
     scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
-    design = motions(moved_mm, found.normals, nominal.pivot_mm) * scale
+    design = np.concatenate([motions(moved_mm, found.normals, nominal.pivot_mm), beside.design]) * scale
+    weights = np.concatenate([weights, beside.weights])
     weighted = design * weights[:, None]
     values, vectors = np.linalg.eigh(weighted.T @ design)
     strong = values > WEAK * max(float(weights.sum()), 1.0)
-    along = vectors.T @ (weighted.T @ found.distance_mm)
+    along = vectors.T @ (weighted.T @ np.concatenate([found.distance_mm, beside.off_mm]))
     scaled = -vectors @ np.where(strong, along / np.where(strong, values, 1.0), 0.0)
     twist = scaled * scale
     twist *= min(1.0, LONGEST_STEP_RAD / (float(np.linalg.norm(twist[:3])) + 1e-12))
@@ -79,7 +118,7 @@ def fit_robust(
         moved_mm = apply(T, points_mm)
         found = nominal.closest(moved_mm) if k < len(ANNEAL) else nominal.closest_from(moved_mm, face)
         face = found.face
-        weights = tukey(found.distance_mm, felt(nominal, found), ANNEAL[min(k, len(ANNEAL) - 1)])
+        weights = tukey(found.distance_mm, ~nominal.end_face[found.face], ANNEAL[min(k, len(ANNEAL) - 1)])
         step = solve_step(nominal, moved_mm, found, weights)
         T, weak = exp(step.twist, nominal.pivot_mm) @ T, step.weak
         if k >= len(ANNEAL) and step.size_mm < close_mm:
@@ -96,15 +135,22 @@ def tukey(distance_mm: Floats, used: Bools, width: float) -> Floats:
 
 
 def fit_kept(
-    points_mm: Floats, start: Fit, kept: Bools, nominal: Nominal, *, steps: int = 15, close_mm: float = 2e-5
+    points_mm: Floats,
+    start: Fit,
+    kept: Bools,
+    nominal: Nominal,
+    held: Held = NOTHING_HELD,
+    *,
+    steps: int = 15,
+    close_mm: float = 2e-5,
 ) -> Fit:
-    """The pose by plain least squares over the `kept` points (n,)."""
+    """The pose by plain least squares over the `kept` points (n,) and what is `held`."""
     T, found, weak = start.T_nominal_scan, start.found, start.weak
     taken, size_mm = 0, np.inf
     while taken < steps and size_mm >= close_mm:
         moved_mm = apply(T, points_mm)
         weights = (kept & felt(nominal, found)).astype(np.float64)
-        step = solve_step(nominal, moved_mm, found, weights)
+        step = solve_step(nominal, moved_mm, found, weights, held.rows(T, nominal.pivot_mm))
         twist = step.twist * min(1.0, LONGEST_KEPT_STEP_MM / (step.size_mm + 1e-12))
         T, weak = exp(twist, nominal.pivot_mm) @ T, step.weak
         found = nominal.closest_from(apply(T, points_mm), found.face)

@@ -7,8 +7,9 @@ from scipy.spatial import cKDTree
 
 from geometry.errors import BadInput
 from geometry.kernels.form import blend, local_fits
-from geometry.kernels.graph import dilate, grow, neighbourhood_mean
+from geometry.kernels.graph import dilate, grow, neighbourhood_mean, neighbourhood_median
 from geometry.kernels.neighbours import cell_index, counting_sort
+from geometry.kernels.parts import over_parts
 from geometry.types import Bools, Floats, Ints
 
 TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
@@ -16,6 +17,7 @@ BLENDED = 6  # nodes around a point whose local fits are blended there
 IRLS_STEPS = 4
 RIDGE = 1e-3  # flat surfaces do not tell all motions
 REACHES = 6
+MEDIAN = 1.25  # a median scatters so much more than a mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +25,10 @@ class MaskSettings:
     neighbours: int = 16
     high: float = 7.0  # of the scale: certainly damaged; among a million points noise does not reach it
     low: float = 2.5  # damaged if joined to what certainly is
+    own: float = 3.0  # of the scatter of single points: sound if its neighbours are
+    ring: int = 5  # nearest neighbours of damage that are damage too
+    shallow_mm: float = 0.02  # of a neighbourhood: a rim that is further off stays damage
+    exact_mm: float = 0.004  # of a neighbourhood: no better is a form known
     form_mm: float = 0.15  # smooth deviations up to this are form, not damage
     rim_mm: float = 2.0  # around points that are further off, where a damage may run out
     form_points: int = 15_000  # of the cloud, to find them
@@ -32,6 +38,8 @@ class MaskSettings:
     def __post_init__(self) -> None:
         if not (self.neighbours >= 4 and 0.0 < self.low <= self.high):
             raise BadInput(f"mask: {self} contradicts itself")
+        if not (min(self.own, self.shallow_mm) > 0.0 and self.exact_mm >= 0.0 and self.ring >= 0):
+            raise BadInput(f"mask: {self} has no rim")
         if not (self.form_mm > 0.0 and self.rim_mm >= 0.0):
             raise BadInput(f"mask: form {self.form_mm} mm and rim {self.rim_mm} mm are no distances")
         if not 20 <= self.form_window <= self.form_nodes <= self.form_points:
@@ -44,16 +52,24 @@ def robust_sigma(values: Floats) -> float:
 
 
 def damaged(residual_mm: Floats, neighbours: Ints, floor_mm: float, settings: MaskSettings) -> Bools:
-    """The points (n,) whose neighbourhood lies off the surface, with one ring around them.
+    """The points (n,) whose neighbourhood lies off the surface, with a narrow ring around them.
 
-    `residual_mm` (n,) is signed, `neighbours` (n, k) of each point. The mean over a neighbourhood keeps
-    what damage does and averages noise away; its robust scatter, but at least `floor_mm`, is the scale.
-    From seeds beyond `high` scales the flag grows over the neighbour graph down to `low`.
+    `residual_mm` (n,) is signed, `neighbours` (n, k) of each point, itself among them. The mean over a
+    neighbourhood keeps what damage does and averages noise away; its robust scatter, but at least
+    `floor_mm`, is the scale. From seeds beyond `high` scales the flag grows over the neighbour graph down
+    to `low`. As the mean carries damage a neighbourhood beyond its rim, points there that are not off
+    themselves and most of whose neighbours are not are let go, before the nearest ones of the rest join it.
     """
     smooth_mm = neighbourhood_mean(residual_mm, neighbours[:, 1:])
-    scale_mm = max(robust_sigma(smooth_mm), floor_mm)
+    scale_mm = max(robust_sigma(smooth_mm), floor_mm, settings.exact_mm)
     size = np.abs(smooth_mm) / scale_mm
-    return np.asarray(dilate(grow(size > settings.high, size > settings.low, neighbours), neighbours))
+    reached = grow(size > settings.high, size > settings.low, neighbours)
+    most_mm = np.abs(neighbourhood_median(residual_mm, neighbours, reached))
+    scatter_mm = max(robust_sigma(residual_mm), scale_mm)
+    beside = most_mm <= min(settings.low * MEDIAN * scale_mm, settings.shallow_mm)
+    let_go = beside & (np.abs(residual_mm) <= settings.own * scatter_mm)
+    ring = np.ascontiguousarray(neighbours[:, : settings.ring + 1])
+    return np.asarray(dilate(reached & ~let_go, ring))
 
 
 def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: MaskSettings) -> Floats:
@@ -109,9 +125,9 @@ def _blend(
     cells = ((nodes_mm.max(axis=0) - low_mm) / cell_mm).astype(np.int64) + 1
     starts, order = counting_sort(cell_index(nodes_mm, low_mm, cell_mm, cells), int(cells.prod()))
     grid = (order, starts, low_mm, cell_mm, cells)
-    return np.asarray(
-        blend(points_mm, normals, nodes_mm, node_normals, fits, BLENDED, TURN_MM, *grid), dtype=np.float64
-    )
+    known = (nodes_mm, node_normals, fits, BLENDED, TURN_MM, *grid)
+    values = over_parts(lambda a, b: blend(points_mm[a:b], normals[a:b], *known), len(points_mm))
+    return np.concatenate(values).astype(np.float64, copy=False)
 
 
 def _node_pitch(nodes_mm: Floats) -> float:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from geometry import outline as outlines
 from geometry.errors import BadInput, BadMesh
+from geometry.kernels.parts import over_parts, threads_for
 from geometry.kernels.triangle import describe_feet, refine_closest
 from geometry.outline import End, Outline
+from geometry.scatter import even_points
 from geometry.solid import (
     check_solid,
-    face_areas_mm2,
     faces_around,
     merge_vertices,
     slice_loops,
@@ -150,13 +151,21 @@ class Nominal:
         For points that moved little since that face was nearest, as between the steps of a fit; a rival
         beyond the neighbouring faces may be missed by a tenth of a micrometre.
         """
+        parts = over_parts(lambda a, b: self._feet(points_mm[a:b], near_face[a:b]), len(points_mm))
+        feet_mm, smooth, distance_mm, face = (
+            np.concatenate(of_parts) for of_parts in zip(*parts, strict=True)
+        )
+        return Closest(points_mm=feet_mm, normals=smooth, distance_mm=distance_mm, face=face)
+
+    def _feet(self, points_mm: Floats, near_face: Ints) -> tuple[Floats, Floats, Floats, Ints]:
+        """Feet, normals, signed distances and faces of the nearest points, from a face near each."""
         mesh, normals = self.mesh, self._normals
         shape = (points_mm, mesh.vertices_mm, mesh.faces)
         face, weights = refine_closest(*shape, near_face, *self._ring)
         feet_mm, smooth, distance_mm = describe_feet(
             *shape, face, weights, normals.corner, normals.face, normals.edge, normals.vertex
         )
-        return Closest(points_mm=feet_mm, normals=smooth, distance_mm=distance_mm, face=face)
+        return feet_mm, smooth, distance_mm, face
 
     def section(self, z_mm: float) -> NominalSection:
         """The airfoil's section at height `z_mm`.
@@ -221,7 +230,7 @@ class Nominal:
         """The nearest face (n,) to float32, computed about the centre of the mesh to lose least."""
         query = np.ascontiguousarray(points_mm - self._centre_mm, dtype=np.float32)
         order = _near_each_other(query)
-        found = self._scene.compute_closest_points(query[order], nthreads=1)
+        found = self._scene.compute_closest_points(query[order], nthreads=threads_for(len(query)))
         face = np.empty(len(query), np.int64)
         face[order] = found["primitive_ids"].numpy()
         return face
@@ -352,7 +361,7 @@ def _sample(nominal: Nominal) -> SurfaceSamples:
     the same way only, so that the two sides of a thin edge stay apart.
     """
     pitch_mm = nominal.settings.sample_mm
-    drawn_mm, face, each_mm2 = _draw(nominal.mesh, nominal.airfoil_face, 9.0 / pitch_mm**2)
+    drawn_mm, face, each_mm2 = even_points(nominal.mesh, nominal.airfoil_face, 9.0 / pitch_mm**2)
     inside = (drawn_mm[:, 2] >= nominal.z_min_mm) & (drawn_mm[:, 2] <= nominal.z_max_mm)
     drawn_mm, face = drawn_mm[inside], face[inside]
     look = nominal.closest(drawn_mm).normals
@@ -375,22 +384,5 @@ def _sample(nominal: Nominal) -> SurfaceSamples:
 
 
 def _shell(nominal: Nominal) -> tuple[Floats, Floats]:
-    points_mm, _, _ = _draw(nominal.mesh, ~nominal.end_face, 1.0)
+    points_mm, _, _ = even_points(nominal.mesh, ~nominal.end_face, 1.0)
     return points_mm, nominal.closest(points_mm).normals
-
-
-def _draw(mesh: Mesh, wanted: Bools, per_mm2: float) -> tuple[Floats, Ints, float]:
-    """Points (n, 3) spread evenly over the wanted faces (m,), the face of each, the area of each.
-
-    The faces are filled in order, one point an equal share of area; where in its face a point lies
-    follows the R2 sequence (Roberts, 2018): no chance, and no clumps.
-    """
-    area_mm2 = np.where(wanted, face_areas_mm2(mesh), 0.0)
-    count = max(1, round(float(area_mm2.sum()) * per_mm2))
-    each_mm2 = float(area_mm2.sum()) / count
-    face = np.searchsorted(np.cumsum(area_mm2), (np.arange(count) + 0.5) * each_mm2)
-    u, v = np.modf(np.arange(count)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]))[0].T
-    u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
-    a, b, c = np.moveaxis(mesh.vertices_mm[mesh.faces[face]], 1, 0)
-    points_mm = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    return points_mm, face, each_mm2

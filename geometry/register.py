@@ -5,15 +5,29 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from geometry.coarse import Coarse, CoarseSettings, find_pose
+from geometry.ends import End, on_rim, scan_ends, without_strays
 from geometry.errors import BadInput, CannotRegister
-from geometry.fit import Fit, every, felt, fit_kept, fit_robust, information, unit_twist
+from geometry.fit import (
+    Fit,
+    Held,
+    every,
+    felt,
+    fit_kept,
+    fit_robust,
+    information,
+    motions,
+    unit_twist,
+)
 from geometry.mask import MaskSettings, damaged, form_of, robust_sigma
 from geometry.nominal import Closest, Nominal
 from geometry.slide import LEAST, slides_mm
 from geometry.surface import k_nearest
-from geometry.transforms import apply, exp
+from geometry.transforms import apply, exp, inverse
 from geometry.types import Bools, Cloud, Floats, Ints
-from geometry.uncertainty import Certainty, certainty, form_covariance
+from geometry.uncertainty import Certainty, certainty, form_covariance, free_inverse
+
+ENDS_MM = 0.01  # standard uncertainty of the surface along a motion beyond which ends of the scan are asked
+LEAST_WEIGHT = 1e-3  # of an end beside all points: enough that no step leaves it out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,11 +97,12 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Settled:
+class Settled:
     """A least-squares pose, the points it rests on, and how certain it is."""
 
     fit: Fit
     kept: Bools
+    normal_matrix: Floats  # (6, 6) of the kept points, unweighted
     information: Floats
     form_covariance: Floats
     certainty: Certainty
@@ -100,22 +115,87 @@ def _thinned(cloud: Cloud, most: int) -> Cloud:
 
 def _settled(
     cloud: Cloud, start: Fit, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
-) -> _Settled:
+) -> Settled:
     """Rounds of mask and least squares on the whole cloud."""
     found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
     fit = replace(start, found=found)
     for _ in range(settings.rounds):
-        kept = ~_damage_of(cloud, fit.found, neighbours, nominal, settings) & felt(nominal, fit.found)
-        if kept.sum() < settings.least_points:
-            raise CannotRegister(f"{int(kept.sum())} scan points lie on the nominal")
-        fit = fit_kept(cloud.points_mm, fit, kept, nominal)
+        sound = ~_damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, nominal, settings)
+        if (sound & felt(nominal, fit.found)).sum() < settings.least_points:
+            raise CannotRegister(f"{int(sound.sum())} scan points lie on the nominal")
+        fit = fit_kept(cloud.points_mm, fit, without_strays(sound, fit.found, nominal), nominal)
         turns += fit.iterations
+    return held_by_ends(cloud, replace(fit, iterations=turns), sound, nominal)
+
+
+def _past_rims_none(found: Closest, nominal: Nominal) -> Closest:
+    """The same feet, those on a rim without a distance: a scan may slide past its end and is no damage."""
+    return replace(found, distance_mm=np.where(on_rim(nominal, found.points_mm), 0.0, found.distance_mm))
+
+
+def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
+    """What a least-squares pose on the sound points (n,) is worth; where these leave a motion open and the
+    scan stops sharply at both ends of the nominal, the pose that lays these ends on it, too.
+    """
+    resting = without_strays(sound, fit.found, nominal)
+    settled = _worth(cloud, fit, resting, nominal)
+    if not settled.certainty.sigma_mm[-1] > ENDS_MM:
+        return settled
+    moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
+    ends = scan_ends(moved_mm, sound, fit.found, nominal)
+    if not ends:
+        return settled
+    held = _held(ends, settled, nominal)
+    again = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
+    return _with_ends(
+        settled, replace(again, iterations=fit.iterations + again.iterations), held, ends, nominal
+    )
+
+
+def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
+    kept = sound & felt(nominal, fit.found)
     moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
     known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept])
     form = form_covariance(nominal, moved_mm, found)
-    return _Settled(
-        fit=replace(fit, iterations=turns),
+    design = motions(moved_mm, found.normals, nominal.pivot_mm)
+    return Settled(
+        fit=fit,
         kept=kept,
+        normal_matrix=design.T @ design,
+        information=known,
+        form_covariance=form,
+        certainty=certainty(nominal, known, form),
+    )
+
+
+def _held(ends: tuple[End, ...], settled: Settled, nominal: Nominal) -> Held:
+    """The ends, each weighted as the points are: by the variance that these show along the open motion."""
+    open_ = settled.certainty.twists[:, -1]
+    a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
+    least = LEAST_WEIGHT * len(settled.kept)
+    back = inverse(settled.fit.T_nominal_scan)
+    return Held(
+        points_mm=apply(back, np.array([end.point_mm for end in ends])),
+        heights_mm=np.array([end.height_mm for end in ends]),
+        weights=np.array([max(a_point_mm2 / end.sigma_mm**2, least) for end in ends]),
+    )
+
+
+def _with_ends(settled: Settled, fit: Fit, held: Held, ends: tuple[End, ...], nominal: Nominal) -> Settled:
+    """The same points with ends beside them: covariances as that weighted least squares passes them on."""
+    rows = held.rows(fit.T_nominal_scan, nominal.pivot_mm)
+    weighted = rows.design.T * rows.weights
+    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    unit = np.outer(scale, scale)
+    both = np.linalg.inv((settled.normal_matrix + weighted @ rows.design) * unit) * unit
+    share = both @ settled.normal_matrix
+    noise = share @ free_inverse(settled.information, scale) @ share.T
+    noise += both @ (weighted * [end.sigma_mm**2 for end in ends]) @ weighted.T @ both
+    known = np.linalg.inv(noise / unit) / unit
+    form = share @ settled.form_covariance @ share.T
+    return replace(
+        settled,
+        fit=fit,
         information=known,
         form_covariance=form,
         certainty=certainty(nominal, known, form),
@@ -123,8 +203,8 @@ def _settled(
 
 
 def _elsewhere(
-    cloud: Cloud, settled: _Settled, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
-) -> list[_Settled]:
+    cloud: Cloud, settled: Settled, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
+) -> list[Settled]:
     """Other poses along the least certain motion that explain more of the scan and are surer of it."""
     sigma_mm, twist = float(settled.certainty.sigma_mm[-1]), settled.certainty.twists[:, -1]
     if sigma_mm <= settings.slide_mm:
@@ -154,7 +234,7 @@ def _damage_of(
 def _alignment(
     cloud: Cloud,
     nominal: Nominal,
-    places: list[_Settled],
+    places: list[Settled],
     coarse: Coarse,
     iterations: int,
     settings: RegisterSettings,
@@ -182,7 +262,7 @@ def _alignment(
     )
 
 
-def _weak(places: list[_Settled], settings: RegisterSettings) -> tuple[tuple[float, ...], ...]:
+def _weak(places: list[Settled], settings: RegisterSettings) -> tuple[tuple[float, ...], ...]:
     """Unit twists that the chosen place leaves open, or that two places contest."""
     chosen = places[min(1, len(places) - 1)]
     open_ = [unit_twist(t) for t in chosen.certainty.twists.T[chosen.certainty.sigma_mm > settings.loose_mm]]
@@ -191,7 +271,7 @@ def _weak(places: list[_Settled], settings: RegisterSettings) -> tuple[tuple[flo
     return tuple(open_) if len(open_) > len(chosen.fit.weak) else chosen.fit.weak
 
 
-def _won(places: list[_Settled]) -> bool:
+def _won(places: list[Settled]) -> bool:
     """Whether the best other place explains twice as many more points as the next that is another one."""
     first, best, *rest = places
     gain = int(best.kept.sum() - first.kept.sum())

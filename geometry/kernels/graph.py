@@ -54,38 +54,52 @@ def neighbourhood_mean(values: Floats, neighbours: Ints) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def only_mutual(neighbours: Ints) -> Ints:
-    """The neighbours (n, k) with -1 for each that does not have the point among its own."""
-    mutual = np.full(neighbours.shape, -1, np.int64)
-    for i in range(len(neighbours)):
-        for j in range(neighbours.shape[1]):
-            q = neighbours[i, j]
-            if q < 0:
-                continue
-            for back in neighbours[q]:
-                if back == i:
-                    mutual[i, j] = q
-                    break
-    return mutual
+def neighbourhood_median(values: Floats, neighbours: Ints, wanted: Bools) -> Floats:
+    """Median (n,) over the neighbours (n, k; -1 none) of each wanted point, NaN for the others."""
+    medians = np.full(len(values), np.nan)
+    members = np.empty(neighbours.shape[1])
+    for i in range(len(values)):
+        found = 0
+        if wanted[i]:
+            for q in neighbours[i]:
+                if q >= 0:
+                    members[found] = values[q]
+                    found += 1
+        if found > 0:
+            medians[i] = np.median(members[:found])
+    return medians
 
 
 @njit(cache=True, nogil=True)
-def component_sizes(neighbours: Ints) -> Ints:
-    """Size (n,) of the connected component of each point, edges taken both ways (n, k; -1 none)."""
-    count = len(neighbours)
+def component_sizes(nearest: Ints, distances: Floats, width: int, reach: float) -> Ints:
+    """Size (n,) of the connected component of each point.
+
+    Two points are joined if they are at most `reach` apart and each is among the first `width` of the other's
+    `nearest` (n, k), which have ascending `distances` (n, k).
+    """
+    count = len(nearest)
     parent = np.arange(count)
     for i in range(count):
-        for q in neighbours[i]:
-            if q >= 0:
-                a, b = _root(parent, i), _root(parent, q)
-                if a != b:
-                    parent[max(a, b)] = min(a, b)
+        for j in range(width):
+            q = nearest[i, j]
+            if q <= i or distances[i, j] > reach:  # each pair once
+                continue
+            a, b = _root(parent, i), _root(parent, q)
+            if a != b and _among(nearest, q, width, i):
+                parent[max(a, b)] = min(a, b)
     size = np.zeros(count, np.int64)
     for i in range(count):
-        size[_root(parent, i)] += 1
-    for i in range(count):
         parent[i] = _root(parent, i)
+        size[parent[i]] += 1
     return size[parent]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _among(nearest, i, width, wanted):  # type: ignore[no-untyped-def]
+    among = False
+    for j in range(width):
+        among = among or nearest[i, j] == wanted
+    return among
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -1,11 +1,17 @@
-"""All k nearest neighbours of a cloud by one cell-sorted grid: exact, and kinder to the cache than a tree."""
+"""All k nearest neighbours of a cloud by one cell-sorted list: exact, and kinder to the cache than a tree."""
 
 import numpy as np
 from numba import njit
 
+from geometry.kernels.parts import over_parts
 from geometry.types import Floats, Ints
 
-MAX_CELLS = 1 << 24  # the cell grows until the grid fits
+AXIS_BITS = 21  # of a key, for each axis: cells are numbered x before y before z
+AXIS_MASK = (1 << AXIS_BITS) - 1
+ROWS = np.array([(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)])  # x, y
+SAMPLE = 20_000  # points that tell how dense a cloud is
+CROWDED = 16  # of them in a cell: too coarse a look
+ROUNDING = 1e-12
 
 
 def k_nearest(points_mm: Floats, k: int) -> tuple[Ints, Floats]:
@@ -13,39 +19,234 @@ def k_nearest(points_mm: Floats, k: int) -> tuple[Ints, Floats]:
 
     Exact. Raises `ValueError` unless 1 <= k <= n.
     """
-    count = len(points_mm)
-    if not 1 <= k <= count:
-        raise ValueError(f"k = {k} neighbours asked of {count} points")
-    low_mm, cell_mm, cells, starts, order = _grid(points_mm, k)
-    indices, distances_mm = nearest_in_grid(points_mm[order], order, starts, low_mm, cell_mm, cells, k)
+    order, nearest, apart_mm = sorted_nearest(points_mm, k)
+    indices, distances_mm = np.empty_like(nearest), np.empty_like(apart_mm)
+    indices[order], distances_mm[order] = order[nearest], apart_mm
     return indices, distances_mm
 
 
-def in_cell_order(points_mm: Floats) -> Ints:
-    """An order (n,) in which neighbours follow each other: what walks the points so stays in the cache."""
-    *_, order = _grid(points_mm, 12)
-    return order
+def sorted_nearest(points_mm: Floats, k: int) -> tuple[Ints, Ints, Floats]:
+    """An order (n,) of the points, cell by cell, and the k nearest (n, k) of the points so ordered.
+
+    Indices and distances are those of `k_nearest(points_mm[order], k)`.
+    """
+    count = len(points_mm)
+    if not 1 <= k <= count:
+        raise ValueError(f"k = {k} neighbours asked of {count} points")
+    low_mm, cell_mm = points_mm.min(axis=0), _cell_size(points_mm, k)
+    keys = cell_keys(points_mm, low_mm, cell_mm)
+    order = np.argsort(keys, kind="stable")
+    sorted_mm, keys = points_mm[order], keys[order]
+    nearest, distances_mm = np.empty((count, k), np.int64), np.empty((count, k))
+    known = (sorted_mm, keys, low_mm, cell_mm, nearest, distances_mm)
+    over_parts(lambda first, last: nearest_in_cells(*known, first, last), count)
+    return order, nearest, distances_mm
 
 
-def _grid(points_mm: Floats, k: int) -> tuple[Floats, float, Ints, Ints, Ints]:
+def _cell_size(points_mm: Floats, k: int) -> float:
+    """The edge of a cell as wide as the k nearest of a point of a surface reach."""
+    sample_mm = points_mm[:: max(1, len(points_mm) // SAMPLE)]
     low_mm = points_mm.min(axis=0)
-    cell_mm = _cell_size(points_mm, low_mm, k)
-    cells = ((points_mm.max(axis=0) - low_mm) / cell_mm).astype(np.int64) + 1
-    starts, order = counting_sort(cell_index(points_mm, low_mm, cell_mm, cells), int(cells.prod()))
-    return low_mm, cell_mm, cells, starts, order
+    extent_mm = max(float((points_mm.max(axis=0) - low_mm).max()), 1e-9)
+    probe_mm, finest_mm = extent_mm / 64.0, extent_mm / (AXIS_MASK - 2)
+    while True:
+        occupied = len(np.unique(cell_keys(sample_mm, low_mm, probe_mm)))
+        if occupied * CROWDED >= len(sample_mm) or probe_mm <= 2.0 * finest_mm:
+            break
+        probe_mm *= 0.5
+    reach_mm = probe_mm * float(np.sqrt(occupied * k / (np.pi * len(points_mm))))
+    return max(reach_mm, finest_mm)
 
 
-def _cell_size(points_mm: Floats, low_mm: Floats, k: int) -> float:
-    """The edge of a cell that holds about k/2 points where there are any: surfaces fill few cells."""
-    extent_mm = np.maximum(points_mm.max(axis=0) - low_mm, 1e-9)
-    sample = points_mm[:: max(1, len(points_mm) // 20000)]
-    probe_mm = float(extent_mm.max()) / 64.0
-    occupied = len(np.unique(((sample - low_mm) / probe_mm).astype(np.int64) @ (1, 65, 65 * 65)))
-    area_mm2 = occupied * probe_mm * probe_mm
-    cell_mm = 0.85 * float(np.sqrt(area_mm2 * k / (np.pi * len(points_mm))))
-    while float(np.prod(np.floor(extent_mm / cell_mm) + 1.0)) > MAX_CELLS:
-        cell_mm *= 1.26
-    return cell_mm
+@njit(cache=True, nogil=True)
+def cell_keys(points: Floats, low: Floats, cell: float) -> Ints:
+    """The number (n,) of the cell of each point (n, 3), in a grid of edge `cell` from `low`."""
+    keys = np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        key = 0
+        for axis in range(3):
+            key = (key << AXIS_BITS) | int((points[i, axis] - low[axis]) / cell)
+        keys[i] = key
+    return keys
+
+
+@njit(cache=True, nogil=True)
+def _first_from(keys: Ints, key: int, low: int) -> int:
+    """The first place from `low` on whose key is at least `key`, in ascending keys."""
+    high = len(keys)
+    while low < high:
+        middle = (low + high) >> 1
+        if keys[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True)
+def nearest_in_cells(
+    points: Floats,
+    keys: Ints,
+    low: Floats,
+    cell: float,
+    indices: Ints,
+    distances: Floats,
+    first: int,
+    last: int,
+) -> None:
+    """Write the k nearest of every point whose cell begins from `first` to before `last`.
+
+    The points are sorted by their cells' `keys`; `indices` (n, k) and `distances` (n, k) are written. The
+    points of a cell share what lies in its 27 cells. A point that has fewer than k of it nearer than
+    anything outside can be is searched for by itself.
+    """
+    count, k = indices.shape
+    start, stop = np.zeros(len(ROWS), np.int64), np.zeros(len(ROWS), np.int64)
+    most = 64
+    near, near2 = np.empty(k, np.int64), np.empty(k)
+    around, xs, ys, zs = np.empty(most, np.int64), np.empty(most), np.empty(most), np.empty(most)
+    chosen, chosen2 = np.empty(most, np.int64), np.empty(most)
+    end = first
+    while 0 < end < count and keys[end] == keys[end - 1]:
+        end += 1
+    while end < last:
+        begin, key = end, keys[end]
+        while end < count and keys[end] == key:
+            end += 1
+        found = _find_rows(keys, key, start, stop)
+        if found > most:
+            most = 2 * found
+            around, xs, ys, zs = np.empty(most, np.int64), np.empty(most), np.empty(most), np.empty(most)
+            chosen, chosen2 = np.empty(most, np.int64), np.empty(most)
+        found = 0
+        for r in range(len(start)):
+            for j in range(start[r], stop[r]):
+                around[found], xs[found], ys[found], zs[found] = j, points[j, 0], points[j, 1], points[j, 2]
+                found += 1
+        farthest = np.inf
+        for i in range(begin, end):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            reach = cell + _margin_in(x, y, z, low, cell, key)
+            if i > begin:  # the last point's nearest are no farther from this one than this
+                dx, dy, dz = x - points[i - 1, 0], y - points[i - 1, 1], z - points[i - 1, 2]
+                reach = min(reach, (farthest + np.sqrt(dx * dx + dy * dy + dz * dz)) * (1.0 + ROUNDING))
+            reach2, taken = reach * reach, 0
+            for j in range(found):
+                dx, dy, dz = xs[j] - x, ys[j] - y, zs[j] - z
+                d2 = dx * dx + dy * dy + dz * dz
+                chosen[taken], chosen2[taken] = around[j], d2
+                taken += d2 <= reach2
+            if taken < k:
+                _search_far(points, keys, low, cell, i, near, near2)
+            else:
+                near2[:] = np.inf
+                for j in range(taken):
+                    _insert(near, near2, chosen[j], chosen2[j], k)
+            _keep(near, near2, i, indices[i], distances[i])
+            farthest = distances[i, k - 1]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _find_rows(keys, key, start, stop):  # type: ignore[no-untyped-def]
+    """How many points the cells around that of `key` hold: in rows of three along z, `start` to `stop`.
+
+    Both only move on from where they stood for the last key.
+    """
+    x, y, z = key >> (2 * AXIS_BITS), (key >> AXIS_BITS) & AXIS_MASK, key & AXIS_MASK
+    found = 0
+    for r in range(len(ROWS)):
+        a, b = x + ROWS[r, 0], y + ROWS[r, 1]
+        first, last = start[r], max(start[r], stop[r])
+        if a >= 0 and b >= 0:
+            row = ((a << AXIS_BITS) | b) << AXIS_BITS
+            while first < len(keys) and keys[first] < row + max(z - 1, 0):
+                first += 1
+            last = max(first, last)
+            while last < len(keys) and keys[last] <= row + z + 1:
+                last += 1
+            found += last - first
+        else:
+            last = first
+        start[r], stop[r] = first, last
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _insert(near, near2, j, d2, k):  # type: ignore[no-untyped-def]
+    """Point j at squared distance d2 put in its place of the ascending list of k."""
+    if d2 < near2[k - 1]:
+        t = k - 1
+        while t > 0 and near2[t - 1] > d2:
+            near[t], near2[t] = near[t - 1], near2[t - 1]
+            t -= 1
+        near[t], near2[t] = j, d2
+
+
+@njit(cache=True, nogil=True)
+def _keep(near: Ints, near2: Floats, i: int, indices: Ints, distances: Floats) -> None:
+    """The list of point i as indices and distances, the point itself before its duplicates."""
+    ahead = near[0]
+    for j in range(len(near)):
+        indices[j] = ahead if near[j] == i else near[j]
+        distances[j] = np.sqrt(near2[j])
+    indices[0] = i
+
+
+@njit(cache=True, nogil=True)
+def _search_far(
+    points: Floats, keys: Ints, low: Floats, cell: float, i: int, near: Ints, near2: Floats
+) -> None:
+    """The nearest of point i in ever larger boxes of cells, until nothing nearer can be outside."""
+    key, shell, k = keys[i], 2, len(near)
+    x, y, z = key >> (2 * AXIS_BITS), (key >> AXIS_BITS) & AXIS_MASK, key & AXIS_MASK
+    inside = _margin_in(points[i, 0], points[i, 1], points[i, 2], low, cell, key)
+    while True:
+        near2[:] = np.inf
+        _scan_box(points, keys, x, y, z, shell, i, near, near2)
+        reach = shell * cell + inside
+        if near2[k - 1] <= reach * reach:
+            return
+        shell += (shell + 1) // 2
+
+
+@njit(cache=True, nogil=True)
+def _scan_box(
+    points: Floats, keys: Ints, x: int, y: int, z: int, shell: int, i: int, near: Ints, near2: Floats
+) -> None:
+    """Insert what lies at most `shell` cells off, leaping over what does not."""
+    y0, z0 = max(y - shell, 0), max(z - shell, 0)
+    j = _first_from(keys, (((max(x - shell, 0) << AXIS_BITS) | y0) << AXIS_BITS) | z0, 0)
+    while j < len(keys):
+        a, b, c = keys[j] >> (2 * AXIS_BITS), (keys[j] >> AXIS_BITS) & AXIS_MASK, keys[j] & AXIS_MASK
+        if a > x + shell:
+            return
+        if b > y + shell:
+            a, b, c = a + 1, y0, z0
+        elif b < y0:
+            b, c = y0, z0
+        elif c > z + shell:
+            b, c = b + 1, z0
+        elif c < z0:
+            c = z0
+        else:
+            dx, dy, dz = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+            _insert(near, near2, j, dx * dx + dy * dy + dz * dz, len(near))
+            j += 1
+            continue
+        j = _first_from(keys, (((a << AXIS_BITS) | b) << AXIS_BITS) | c, j)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _margin_in(x, y, z, low, cell, key):  # type: ignore[no-untyped-def]
+    a, b, c = key >> (2 * AXIS_BITS), (key >> AXIS_BITS) & AXIS_MASK, key & AXIS_MASK
+    return margin(x, y, z, low, cell, a, b, c)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def margin(x, y, z, low, cell, a, b, c):  # type: ignore[no-untyped-def]
+    """Distance from the point to the nearest wall of its own cell."""
+    x, y, z = x - low[0] - a * cell, y - low[1] - b * cell, z - low[2] - c * cell
+    return max(min(x, cell - x, y, cell - y, z, cell - z), 0.0)
 
 
 def cell_index(points_mm: Floats, low_mm: Floats, cell_mm: float, cells: Ints) -> Ints:
@@ -67,79 +268,3 @@ def counting_sort(keys: Ints, bins: int) -> tuple[Ints, Ints]:
         order[cursor[keys[i]]] = i
         cursor[keys[i]] += 1
     return starts, order
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _scan(sorted_points, first, last, i, near2, near):  # type: ignore[no-untyped-def]
-    """Insert the points first..last but i into the ascending list of those nearest to point i."""
-    x, y, z = sorted_points[i, 0], sorted_points[i, 1], sorted_points[i, 2]
-    k = len(near2)
-    for j in range(first, last):
-        if j == i:
-            continue
-        dx, dy, dz = sorted_points[j, 0] - x, sorted_points[j, 1] - y, sorted_points[j, 2] - z
-        d2 = dx * dx + dy * dy + dz * dz
-        if d2 < near2[k - 1]:
-            t = k - 1
-            while t > 0 and near2[t - 1] > d2:
-                near2[t] = near2[t - 1]
-                near[t] = near[t - 1]
-                t -= 1
-            near2[t] = d2
-            near[t] = j
-
-
-@njit(cache=True, nogil=True)
-def nearest_in_grid(
-    sorted_points: Floats, order: Ints, starts: Ints, low: Floats, cell: float, cells: Ints, k: int
-) -> tuple[Ints, Floats]:
-    """The k nearest of every point, searching growing shells of cells until nothing nearer can be outside.
-
-    `sorted_points` are the points in cell order, `order` maps them back, `starts` are the cells' runs.
-    """
-    count = len(sorted_points)
-    nx, ny, nz = cells[0], cells[1], cells[2]
-    indices = np.empty((count, k), np.int64)
-    distances = np.empty((count, k))
-    near2 = np.empty(k)
-    near = np.empty(k, np.int64)
-    for i in range(count):
-        x, y, z = sorted_points[i, 0], sorted_points[i, 1], sorted_points[i, 2]
-        a = min(int((x - low[0]) / cell), nx - 1)
-        b = min(int((y - low[1]) / cell), ny - 1)
-        c = min(int((z - low[2]) / cell), nz - 1)
-        near2[:] = np.inf
-        near2[0] = -1.0  # the point itself stays first, before its duplicates
-        near[0] = i
-        if k > 1:
-            shell = 0
-            inside = margin(x, y, z, low, cell, a, b, c)
-            while shell <= max(nx, ny, nz):
-                c0, c1 = c - shell, c + shell
-                first, last = max(0, c0), min(nz - 1, c1)
-                for ia in range(max(0, a - shell), min(nx - 1, a + shell) + 1):
-                    for ib in range(max(0, b - shell), min(ny - 1, b + shell) + 1):
-                        row = starts[(ia * ny + ib) * nz : (ia * ny + ib + 1) * nz + 1]
-                        if abs(ia - a) == shell or abs(ib - b) == shell:
-                            _scan(sorted_points, row[first], row[last + 1], i, near2, near)
-                            continue
-                        if c0 >= 0:
-                            _scan(sorted_points, row[c0], row[c0 + 1], i, near2, near)
-                        if c1 < nz:
-                            _scan(sorted_points, row[c1], row[c1 + 1], i, near2, near)
-                reach = shell * cell + inside
-                if near2[k - 1] <= reach * reach:
-                    break
-                shell += 1
-        at = order[i]
-        for t in range(k):
-            indices[at, t] = order[near[t]]
-            distances[at, t] = np.sqrt(max(near2[t], 0.0))
-    return indices, distances
-
-
-@njit(cache=True, nogil=True, inline="always")
-def margin(x, y, z, low, cell, a, b, c):  # type: ignore[no-untyped-def]
-    """Distance from the point to the nearest wall of its own cell."""
-    x, y, z = x - low[0] - a * cell, y - low[1] - b * cell, z - low[2] - c * cell
-    return max(min(x, cell - x, y, cell - y, z, cell - z), 0.0)

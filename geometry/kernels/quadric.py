@@ -151,22 +151,22 @@ def cholesky_solve(a: Floats, b: Floats) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def plane_heights(points: Floats, nearest: Ints) -> tuple[Floats, Floats]:
+def plane_heights(points: Floats, nearest: Ints, width: int) -> tuple[Floats, Floats]:
     """Height (n,) of each point over the plane of its neighbours, and these neighbours' rms about it (n,).
 
-    `nearest` (n, k) has the point itself first; it takes no part in its own plane.
+    The first `width` of `nearest` (n, k) count; the point itself, which is first, takes no part.
     """
-    count, k = nearest.shape
+    count = len(nearest)
     height, scatter = np.empty(count), np.empty(count)
     frame = np.empty((3, 3))
     for i in range(count):
-        near = nearest[i, 1:]
+        near = nearest[i, 1:width]
         mx, my, mz = _tangent_frame(points, near, frame)
         nx, ny, nz = frame[2, 0], frame[2, 1], frame[2, 2]
         total = 0.0
         for q in near:
             w = (points[q, 0] - mx) * nx + (points[q, 1] - my) * ny + (points[q, 2] - mz) * nz
             total += w * w
-        scatter[i] = np.sqrt(total / (k - 1))
+        scatter[i] = np.sqrt(total / (width - 1))
         height[i] = (points[i, 0] - mx) * nx + (points[i, 1] - my) * ny + (points[i, 2] - mz) * nz
     return height, scatter

@@ -5,6 +5,8 @@ import pytest
 
 from geometry.clean import CleanSettings, clean
 from geometry.errors import BadInput
+from geometry.kernels.neighbours import k_nearest
+from geometry.neighbourhood import nearest_of
 from geometry.types import Cloud
 from tests.geometry import blades
 
@@ -75,6 +77,19 @@ def test_order_of_the_points_does_not_matter():
     shuffled = points[rng.permutation(len(points))]
     a, b = (clean(cloud_of(p), CleanSettings(most_points=3000)).points_mm for p in (points, shuffled))
     assert {tuple(p) for p in a} == {tuple(p) for p in b}
+
+
+def test_the_neighbours_that_come_along_are_the_nearest():
+    rng = np.random.default_rng(6)
+    good = scanned(rng, per_mm2=2.0).points_mm
+    kept = clean(cloud_of(np.concatenate([good, rng.uniform([-60, 20, 0], [60, 60, 100], (50, 3))])))
+    nearest, expected = nearest_of(kept, 17), k_nearest(kept.points_mm, 17)[1]
+    whole = (nearest >= 0).all(axis=1)
+    assert whole.mean() > 0.99
+    distances = np.linalg.norm(kept.points_mm[nearest] - kept.points_mm[:, None], axis=2)
+    assert np.abs(distances - expected)[whole].max() < 1e-12
+    assert (nearest[:, 0] == np.arange(len(kept))).all()
+    assert np.array_equal(nearest_of(kept, 5), k_nearest(kept.points_mm, 5)[0])
 
 
 def test_a_handful_of_points_is_returned_as_it_is():

@@ -1,10 +1,9 @@
 """Flags on neighbour graphs against loops in Python."""
 
 import numpy as np
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from geometry.kernels.graph import component_sizes, dilate, grow, neighbourhood_mean, only_mutual
+from geometry.kernels.graph import component_sizes, dilate, grow, neighbourhood_mean, neighbourhood_median
 
 
 def random_graph(seed, count=200, k=3):
@@ -41,15 +40,24 @@ def test_mean_counts_the_point_and_its_real_neighbours():
     assert np.allclose(neighbourhood_mean(values, neighbours), slow)
 
 
-def test_mutual_neighbours_name_each_other():
-    neighbours, _ = random_graph(5, count=40, k=6)
-    slow = [[q if q >= 0 and i in neighbours[q] else -1 for q in row] for i, row in enumerate(neighbours)]
-    assert only_mutual(neighbours).tolist() == slow
+def test_median_is_that_of_the_real_neighbours_where_wanted():
+    neighbours, rng = random_graph(6, k=4)
+    values, wanted = rng.normal(size=200), rng.random(200) < 0.5
+    slow = [
+        np.median(values[row[row >= 0]]) if want and (row >= 0).any() else np.nan
+        for row, want in zip(neighbours, wanted, strict=True)
+    ]
+    assert np.array_equal(neighbourhood_median(values, neighbours, wanted), slow, equal_nan=True)
 
 
-def test_component_sizes_match_scipy():
-    neighbours, _ = random_graph(4, k=1)
-    rows = np.flatnonzero(neighbours[:, 0] >= 0)
-    graph = coo_array((np.ones(len(rows)), (rows, neighbours[rows, 0])), shape=(200, 200))
-    _, label = connected_components(graph, directed=False)
-    assert (component_sizes(neighbours) == np.bincount(label)[label]).all()
+def test_components_join_what_is_near_and_mutual():
+    points = np.random.default_rng(5).uniform(0.0, 10.0, (150, 2))
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, :6]
+    distances = np.take_along_axis(apart, nearest, axis=1)
+    named = np.zeros((150, 150), bool)
+    np.put_along_axis(named, nearest[:, :4], True, axis=1)
+    _, label = connected_components(named & named.T & (apart <= 0.9), directed=False)
+    assert 10 < label.max() < 140
+    sizes = component_sizes(nearest, distances, 4, 0.9)
+    assert (sizes == np.bincount(label)[label]).all()

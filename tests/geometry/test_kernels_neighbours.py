@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from geometry.kernels.neighbours import counting_sort, k_nearest
+from geometry.kernels.neighbours import counting_sort, k_nearest, sorted_nearest
 
 
 def slow_distances(points, k):
@@ -35,12 +35,33 @@ def test_a_surface_of_uneven_density_with_a_far_cluster_matches_a_tree():
     assert np.abs(distances - cKDTree(points).query(points, 16)[0]).max() < 1e-12
 
 
+def test_strays_far_from_everything_match_a_tree():
+    rng = np.random.default_rng(6)
+    sheet = np.column_stack([rng.uniform(0, 30, (4000, 2)), rng.normal(scale=0.01, size=4000)])
+    strays = rng.uniform(-200.0, 200.0, (60, 3))
+    points = np.concatenate([sheet, strays, [[1e6, 0.0, 0.0]]])
+    _, distances = k_nearest(points, 9)
+    assert np.allclose(distances, cKDTree(points).query(points, 9)[0], rtol=1e-12, atol=1e-12)
+
+
+def test_the_sorted_answer_is_that_of_the_sorted_points():
+    points = np.random.default_rng(7).normal(size=(3000, 3))
+    order, nearest, distances = sorted_nearest(points, 5)
+    assert np.array_equal(np.sort(order), np.arange(3000))
+    indices, expected = k_nearest(points[order], 5)
+    assert np.array_equal(nearest, indices)
+    assert np.array_equal(distances, expected)
+
+
 def test_duplicates_keep_the_point_itself_first():
     points = np.repeat(np.random.default_rng(4).normal(size=(20, 3)), 4, axis=0)
     indices, distances = k_nearest(points, 5)
     assert indices[:, 0].tolist() == list(range(80))
     assert (distances[:, :4] == 0.0).all()
     assert all(len(set(row)) == 5 for row in indices)
+    indices, distances = k_nearest(np.zeros((9, 3)), 4)
+    assert indices[:, 0].tolist() == list(range(9))
+    assert (distances == 0.0).all()
 
 
 @pytest.mark.parametrize("k", [0, 6])

@@ -29,6 +29,17 @@ def test_damage_deeper_than_three_sigma_is_found_and_little_else(sigma):
     assert flags[np.hypot(*points[:, :2].T) > 4.0].mean() < 0.005
 
 
+def test_beside_a_steep_rim_only_the_nearest_points_are_lost():
+    points, residual, _ = plate(np.random.default_rng(4), 0.01)
+    radius = np.hypot(*points[:, :2].T)
+    residual = np.where(radius < 4.0, residual - 2.0, residual)
+    nearest, apart = k_nearest(points, 17)
+    flags = damaged(residual, nearest, 0.0025, MaskSettings())
+    assert flags[radius < 4.0].all()
+    reach = 4.0 + np.quantile(apart[:, 5], 0.99)
+    assert flags[radius > reach].mean() < 0.001
+
+
 def test_excess_counts_as_much_as_missing():
     points, residual, _ = plate(np.random.default_rng(3), 0.015)
     neighbours, _ = k_nearest(points, 17)
@@ -62,7 +73,16 @@ def test_form_of_a_surface_that_is_nowhere_near_is_nothing():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"low": 9.0}, {"low": 0.0}, {"neighbours": 2}, {"form_mm": 0.0}, {"form_window": 5}]
+    "wrong",
+    [
+        {"low": 9.0},
+        {"low": 0.0},
+        {"neighbours": 2},
+        {"form_mm": 0.0},
+        {"own": 0.0},
+        {"ring": -1},
+        {"form_window": 5},
+    ],
 )
 def test_settings_that_contradict_themselves_are_refused(wrong):
     with pytest.raises(BadInput, match="mask"):

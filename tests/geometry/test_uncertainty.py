@@ -77,6 +77,36 @@ def test_the_form_is_stated_within_a_factor_of_a_few():
     assert np.sqrt(np.mean(twists[:, 3] ** 2)) > 3.0 * noise_mm
 
 
+@pytest.mark.parametrize("waves", [3, 6, 12])
+@pytest.mark.parametrize("along", ["chord", "span"])
+def test_waves_are_stated_within_a_factor_of_a_few(along, waves):
+    """Pure waves of the size of a form: their errors are within what is stated, and not far within."""
+    rng = np.random.default_rng(5)
+    x, _, z = exact().points_mm.T
+    side = np.sign(exact().normals[:, 1] + 1e-12)
+    place = x / BLADE.chord_mm if along == "chord" else z / BLADE.height_mm
+    wall = np.abs(exact().normals[:, 2]) < 0.7
+    residuals = []
+    for _ in range(12):
+        turn = 2.0 * np.pi * (waves * place + rng.random())
+        form = 0.02 * np.sin(turn) * (side if rng.random() < 0.5 else 1.0) * wall
+        residuals.append(form + rng.normal(scale=SIGMA_MM, size=len(form)))
+    spread = np.sqrt(np.mean(scaled_errors(residuals) ** 2, axis=0))
+    assert ((spread > 0.1) & (spread < 2.0)).all()
+
+
+def test_flat_facets_are_no_surface():
+    """A coarse nominal of the same blade: its facets lie inside, which no scatter of the residuals shows."""
+    coarse = prepare_nominal(
+        blades.mesh(BLADE, around=60, up=12), NominalSettings(z_min_mm=0.0, z_max_mm=BLADE.height_mm)
+    )
+    points_mm = exact().points_mm[exact().points_mm[:, 2] < 30.0]
+    found = coarse.closest(points_mm)
+    kept = ~coarse.end_face[found.face]
+    form = form_covariance(coarse, points_mm[kept], found.of(kept))
+    assert np.sqrt(form[5, 5]) > 0.1
+
+
 def test_a_free_motion_is_huge_and_finite():
     free = np.diag([1e6, 1e6, 0.0, 1e6, 1e6, 0.0])
     stated = certainty(nominal(), free, np.zeros((6, 6)))

@@ -1,0 +1,103 @@
+"""Where a scan stops: sharp ends at both rims hold it, anything else does not."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from geometry.ends import on_rim, rims, scan_ends
+from geometry.nominal import NominalSettings, prepare_nominal
+from geometry.register import register
+from geometry.transforms import apply, inverse, rigid
+from geometry.types import Cloud
+from tests.geometry import blades
+
+SCREW = blades.Blade(taper=0.0, thickness_taper=0.0)
+SIGMA_MM = 0.02
+T_TRUE = rigid(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([30.0, -20.0, 10.0]))
+
+
+@cache
+def nominal():
+    return prepare_nominal(blades.mesh(SCREW), NominalSettings(z_min_mm=0.0, z_max_mm=SCREW.height_mm))
+
+
+def open_scan(seed, per_mm2=3.0):
+    """The walls alone, with noise in every direction, as scans of a blade without its tip face are."""
+    rng = np.random.default_rng(seed)
+    scan = blades.scan(SCREW, per_mm2, rng, tip_face=False)
+    return scan.points_mm + rng.normal(scale=SIGMA_MM, size=scan.points_mm.shape)
+
+
+def ends_of(points_mm):
+    found = nominal().closest(points_mm)
+    return scan_ends(points_mm, np.ones(len(points_mm), bool), found, nominal())
+
+
+def registered(points_mm):
+    count = len(points_mm)
+    cloud = Cloud(
+        points_mm=apply(inverse(T_TRUE), points_mm),
+        sigma_mm=np.full(count, SIGMA_MM),
+        view=np.zeros(count, np.int64),
+    )
+    alignment = register(cloud, nominal())
+    samples_mm = nominal().samples.points_mm
+    moved_mm = apply(alignment.T_nominal_scan @ inverse(T_TRUE), samples_mm) - samples_mm
+    return alignment, float(np.linalg.norm(moved_mm, axis=1).max())
+
+
+def test_rims_run_round_both_ends():
+    bottom, tip = rims(nominal())
+    assert (bottom.low_mm, bottom.high_mm) == (0.0, 0.0)
+    assert tip.low_mm == pytest.approx(105.0)
+    around = np.linspace(0.0, 2.0 * np.pi, 50)
+    edge_mm = SCREW.point(around, np.full(50, 105.0))
+    assert on_rim(nominal(), edge_mm).all()
+    assert not on_rim(nominal(), edge_mm - [0.0, 0.0, 0.2]).any()
+
+
+@pytest.mark.parametrize("shift_mm", [-0.3, 0.0, 0.4])
+def test_both_ends_tell_how_far_a_scan_slid(shift_mm):
+    ends = ends_of(open_scan(1) + np.array([0.0, 0.0, shift_mm]))
+    assert len(ends) == 2
+    for end in ends:
+        assert abs(end.off_mm - shift_mm) < 4.0 * end.sigma_mm
+        assert end.sigma_mm < 0.03
+
+
+def test_ends_are_as_certain_as_they_say():
+    scaled = np.array(
+        [[end.off_mm / end.sigma_mm for end in ends_of(open_scan(seed))] for seed in range(2, 22)]
+    )
+    assert 0.5 < np.sqrt(np.mean(scaled**2)) < 1.3
+
+
+def test_a_short_scan_has_no_ends():
+    points_mm = open_scan(30)
+    assert ends_of(points_mm[points_mm[:, 2] < 104.7]) == ()
+
+
+def test_a_ragged_scan_has_no_ends():
+    points_mm = open_scan(31)
+    ragged = points_mm[:, 2] < 104.7 + 0.3 * np.sin(0.7 * points_mm[:, 0])
+    assert ends_of(points_mm[ragged]) == ()
+
+
+def test_a_seen_tip_face_needs_no_end():
+    scan = blades.scan(SCREW, 3.0, np.random.default_rng(32))
+    assert ends_of(scan.points_mm) == ()
+
+
+def test_a_screw_is_held_by_its_ends():
+    alignment, off_mm = registered(open_scan(33))
+    assert alignment.weak_directions == ()
+    assert off_mm < 0.03
+    sigma_mm = np.sqrt(np.linalg.inv(alignment.information)[5, 5])
+    assert 0.003 < sigma_mm < 0.03
+
+
+def test_a_screw_cut_short_slides_but_never_confidently():
+    points_mm = open_scan(34, 1.5)
+    alignment, _ = registered(points_mm[points_mm[:, 2] < 103.0])
+    assert len(alignment.weak_directions) == 1
