@@ -19,8 +19,9 @@ from geometry.clean import CleanSettings, clean
 from geometry.coverage import measure_coverage
 from geometry.damage import Damage, DamageKind, DamageSettings, detection_limit, find_damages
 from geometry.errors import CannotMeasure
-from geometry.fuse import fuse, overlaps
+from geometry.fuse import fuse
 from geometry.nominal import Nominal
+from geometry.overlap import refine_axis
 from geometry.register import Alignment, mask_damage
 from geometry.repair import RepairVolume, find_repairs
 from geometry.transforms import apply
@@ -29,12 +30,14 @@ from geometry.types import Bools, Cloud, Floats, Measured, NotMeasured, View, Zo
 from station.measurement import NO_TWIN, Measurement
 from station.methods import align, cut_sections, make_twin
 from station.recipe import Recipe
+from station.widen import widened
 
 T = TypeVar("T")
 Clock = Callable[[], float]
 Progress = Callable[[str], None]
 
 DAMAGE_MARGIN_MM = 0.5  # a section this near to a damage needs points that lie on it
+AXIS_SIGMAS = 6.0  # a scanner that was knocked; no calibration is that unlucky
 VIEW_BIAS_SIGMAS = 3.0  # a view that lies farther off the others was not taken where the table said
 
 
@@ -56,9 +59,11 @@ def conclude(state: Views, recipe: Recipe, clock: Clock, progress: Progress) -> 
         raise ValueError("views cannot be merged without the calibration of the turntable's axis")
     run = Run(clock=clock, progress=progress)
     views = sorted(state.views, key=lambda view: view.index)
-    cloud = run.step("fuse", fused, views, recipe)
-    points = sum(len(view.points_mm) for view in views)
-    return run.measurement(points) if cloud is None else measured(cloud, recipe, run)
+    merged = run.step("fuse", fused, views, recipe)
+    if merged is None:
+        return run.measurement(sum(len(view.points_mm) for view in views))
+    cloud, axis_mm = merged
+    return widened(measured(cloud, recipe, run), axis_mm)
 
 
 def measure_cloud(cloud: Cloud, recipe: Recipe, clock: Clock, progress: Progress) -> Measurement:
@@ -140,15 +145,19 @@ class Run:
         return Measurement(points=points, failures=dict(self.failures), timing_s=dict(self.timing_s))
 
 
-def fused(views: Sequence[View], recipe: Recipe) -> Cloud:
-    """The views as one cloud; raises `CannotMeasure` if one of them disagrees with the others."""
+def fused(views: Sequence[View], recipe: Recipe) -> tuple[Cloud, float]:
+    """The views as one cloud, on the axis on which they agree best, and how far that leaves a point open, mm.
+
+    Raises `CannotMeasure` where the calibration denies that axis, or a view disagrees with the others."""
     sigma_mm = recipe.plan.measurement.sigma_mm
     assert recipe.axis is not None
-    cloud = fuse(views, recipe.axis, sigma_mm)
-    for overlap in overlaps(cloud):
+    refined = refine_axis(views, recipe.axis, sigma_mm)
+    if not refined.moved_sigmas <= AXIS_SIGMAS:
+        raise CannotMeasure(f"the views' axis lies {refined.moved_sigmas:.1f} sigmas off its calibration")
+    for overlap in refined.overlaps:
         if not overlap.bias_mm <= VIEW_BIAS_SIGMAS * sigma_mm:
             raise CannotMeasure(f"view {overlap.view} lies {overlap.bias_mm:.3f} mm off the others")
-    return cloud
+    return fuse(views, refined.axis, sigma_mm), refined.surface_mm
 
 
 def as_cloud(points_mm: Floats, sigma_mm: float) -> Cloud:

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from geometry.airfoil import SectionStatus
+from geometry.calibrate import AxisCalibration
 from geometry.damage import DamageKind
 from geometry.errors import CannotMeasure
-from geometry.fuse import Overlap
+from geometry.overlap import Overlap, RefinedAxis
 from geometry.types import Cloud, Measurand, NotMeasured, View, Zone
 from station import measure
 from station.gates import Acceptance
@@ -59,6 +60,11 @@ def recipe(**changed: Any) -> Recipe:
     return Recipe(**{**fields, **changed})
 
 
+def agreed(*overlaps: Overlap, moved_sigmas: float = 0.5, surface_mm: float = 0.0) -> RefinedAxis:
+    axis = AxisCalibration(T_scanner_table0=np.eye(4), sigma_offset_mm=0.001, sigma_tilt_deg=0.001)
+    return RefinedAxis(axis=axis, moved_sigmas=moved_sigmas, surface_mm=surface_mm, overlaps=overlaps)
+
+
 @pytest.fixture
 def geometry(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What each step of the chain gives; a `CannotMeasure` is raised instead."""
@@ -67,7 +73,7 @@ def geometry(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     )
     given: dict[str, Any] = {
         "fuse": as_cloud(POINTS, 0.015),
-        "overlaps": (),
+        "refine_axis": agreed(),
         "align": Aligned(alignment=alignment(), service=None),
         "mask_damage": np.zeros(4, bool),
         "make_twin": twin,
@@ -191,8 +197,34 @@ def test_views_fold_in_plan_order(geometry: dict[str, Any], monkeypatch: pytest.
     assert judge(done, plan(), GATES).verdict == Word.PASS
 
 
+def test_what_the_axis_leaves_open_is_in_every_sigma(geometry: dict[str, Any]) -> None:
+    exact = conclude(Views(views=tuple(views(0, 1))), recipe(), ticks(), lambda step: None)
+    geometry["refine_axis"] = agreed(surface_mm=0.02)
+    done = conclude(Views(views=tuple(views(0, 1))), recipe(), ticks(), lambda step: None)
+    for before, after in ((exact.form_mm, done.form_mm), *paired(exact.sections[0], done.sections[0])):
+        assert isinstance(before, Measurand)
+        assert isinstance(after, Measurand)
+        assert after.value == before.value
+        if after.unit == "mm":
+            assert after.sigma == pytest.approx(np.hypot(before.sigma, 0.02))
+        else:
+            assert after.sigma > before.sigma
+
+
+def paired(before: Any, after: Any) -> Iterator[tuple[Any, Any]]:
+    for name, measured in before.measurands.items():
+        yield measured, after.measurands[name]
+
+
+def test_views_that_deny_the_calibration_of_the_axis_hold(geometry: dict[str, Any]) -> None:
+    geometry["refine_axis"] = agreed(moved_sigmas=9.0)
+    done = conclude(Views(views=tuple(views(0, 1))), recipe(), ticks(), lambda step: None)
+    assert done.failures == {"fuse": "the views' axis lies 9.0 sigmas off its calibration"}
+    assert judge(done, plan(), GATES).verdict == Word.HOLD
+
+
 def test_a_view_off_the_others_holds(geometry: dict[str, Any]) -> None:
-    geometry["overlaps"] = (Overlap(view=3, points=900, rms_mm=0.09, bias_mm=0.08),)
+    geometry["refine_axis"] = agreed(Overlap(view=3, points=900, rms_mm=0.09, bias_mm=0.08))
     done = conclude(Views(views=tuple(views(0, 1))), recipe(), ticks(), lambda step: None)
     assert done.failures == {"fuse": "view 3 lies 0.080 mm off the others"}
     assert (done.points, done.alignment) == (3, None)
