@@ -19,9 +19,9 @@ from geometry.fit import (
     unit_twist,
 )
 from geometry.mask import MaskSettings, damaged, form_of, robust_sigma
+from geometry.neighbourhood import nearest_of
 from geometry.nominal import Closest, Nominal
 from geometry.slide import LEAST, slides_mm
-from geometry.surface import k_nearest
 from geometry.transforms import apply, exp, inverse
 from geometry.types import Bools, Cloud, Floats, Ints
 from geometry.uncertainty import Certainty, certainty, form_covariance, free_inverse
@@ -90,7 +90,7 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
     cloud = _thinned(cloud, settings.fit_points)
     few_mm = cloud.points_mm[every(len(cloud), settings.robust_points)]
     robust = fit_robust(few_mm, coarse.T_nominal_scan, nominal)
-    neighbours, _ = k_nearest(cloud.points_mm, min(settings.mask.neighbours + 1, len(cloud)))
+    neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
     settled = _settled(cloud, robust, neighbours, nominal, settings)
     places = [settled, *_elsewhere(cloud, settled, neighbours, nominal, settings)]
     return _alignment(cloud, nominal, places, coarse, robust.iterations, settings)
@@ -109,6 +109,8 @@ class Settled:
 
 
 def _thinned(cloud: Cloud, most: int) -> Cloud:
+    if len(cloud) <= most:
+        return cloud
     kept = every(len(cloud), most)
     return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
 
@@ -285,9 +287,9 @@ def mask_damage(
     nominal: Nominal,
     settings: RegisterSettings = RegisterSettings(),
 ) -> Bools:
-    """The points (n,) of an aligned cloud that lie on damage, with one ring of neighbours around it."""
+    """The points (n,) of an aligned cloud that lie on damage, with the points next to it."""
     found = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
-    neighbours, _ = k_nearest(cloud.points_mm, min(settings.mask.neighbours + 1, len(cloud)))
+    neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
     return _damage_of(cloud, found, neighbours, nominal, settings)
 
 
