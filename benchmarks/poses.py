@@ -19,12 +19,12 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.errors import CannotRegister
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.register import Alignment, register
+from geometry.registration.register import Alignment, register
+from geometry.registration.uncertainty import certainty
 from geometry.transforms import apply, inverse, log, rigid
 from geometry.types import Cloud, Floats
-from geometry.uncertainty import certainty
 from station.gates import ACCEPTANCE, pose_doubts
 from tests.geometry import blades
 

@@ -22,14 +22,14 @@ from functools import partial
 import numpy as np
 
 from benchmarks.views import row_of
-from geometry.airfoil import SectionSettings, measure_sections
-from geometry.broken import Skin
+from geometry.blade.nominal import Nominal
+from geometry.damage.broken import Skin
 from geometry.errors import CannotMeasure
-from geometry.nominal import Nominal
-from geometry.register import Alignment
+from geometry.registration.register import Alignment
+from geometry.registration.uncertainty import certainty
+from geometry.sections.airfoil import SectionSettings, measure_sections
 from geometry.transforms import apply, inverse, log
 from geometry.types import Floats, Measurand
-from geometry.uncertainty import certainty
 from simulators.calibration_file import calibrated_axis
 from simulators.damage_solids import Cut
 from simulators.presets import CutMaker, broken_corner, repairable_nick, repairable_pit

@@ -32,15 +32,15 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from geometry.clean import clean
-from geometry.coarse import CoarseSettings, find_pose
-from geometry.fit import Fit, fit_kept, motions
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
-from geometry.register import Alignment, held_by_ends, mask_damage, register
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
+from geometry.registration.coarse import CoarseSettings, find_pose
+from geometry.registration.fit import Fit, fit_kept, motions
+from geometry.registration.register import Alignment, held_by_ends, mask_damage, register
+from geometry.registration.uncertainty import certainty
+from geometry.scan.clean import clean
 from geometry.thesis.fine_tuned import register_thesis
 from geometry.transforms import apply, inverse, log, rigid
 from geometry.types import Cloud, Floats
-from geometry.uncertainty import certainty
 from tests.geometry import blades
 
 BLADES = {"tapered": blades.Blade(), "constant": blades.Blade(taper=0.0, thickness_taper=0.0)}

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from geometry.repair import RepairSettings, find_repairs
+from geometry.repair.patches import RepairSettings, find_repairs
 from geometry.types import Zone
 from tests.geometry import repair_blades as blades
 

@@ -19,10 +19,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from geometry.airfoil import measure_sections
-from geometry.band import band_of
-from geometry.chart import SectionSettings, unroll
-from geometry.curve import (
+from geometry.blade.nominal import NominalSection
+from geometry.errors import GeometryError
+from geometry.sections.airfoil import measure_sections
+from geometry.sections.band import band_of
+from geometry.sections.chart import SectionSettings, unroll
+from geometry.sections.curve import (
     camber_line,
     centroid,
     centroid_gradient,
@@ -33,10 +35,8 @@ from geometry.curve import (
     thick_part,
     thickness,
 )
-from geometry.errors import GeometryError
-from geometry.measurands import define, form, place, shape
-from geometry.nominal import NominalSection
-from geometry.profile import Scan, reconstruct
+from geometry.sections.measurands import define, form, place, shape
+from geometry.sections.profile import Scan, reconstruct
 from geometry.types import Floats, Measurand
 from tests.geometry.airfoils import (
     AnalyticNominal,

@@ -23,9 +23,9 @@ from benchmarks.sections import (
     in_service_blade,
     table,
 )
-from geometry.chart import SectionSettings, unroll
-from geometry.curve import centroid, centroid_gradient, node_shares, orientation
 from geometry.errors import CannotMeasure
+from geometry.sections.chart import SectionSettings, unroll
+from geometry.sections.curve import centroid, centroid_gradient, node_shares, orientation
 from geometry.thesis.rwlls_profile import reconstruct_thesis
 from geometry.thesis.rwlls_sections import trace
 from geometry.types import Floats

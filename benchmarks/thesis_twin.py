@@ -24,11 +24,11 @@ from functools import partial
 
 import numpy as np
 
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.register import Alignment, register
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.deformation.twin import Twin, TwinSettings, fit_twin
+from geometry.registration.register import Alignment, register
 from geometry.thesis.stiff_twin import ThesisTwinSettings, fit_twin_thesis
 from geometry.transforms import apply, inverse
-from geometry.twin import Twin, TwinSettings, fit_twin
 from geometry.types import Bools, Cloud, Floats, Mesh
 from tests.geometry import twin_blades as blades
 from tests.geometry.poses import in_place

@@ -24,12 +24,12 @@ import numpy as np
 import trimesh
 from trimesh.registration import nricp_amberg, nricp_sumner
 
-from geometry.damage import find_damages
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.register import Alignment
-from geometry.repair import RepairSettings, find_repairs
-from geometry.solid import slice_loops
-from geometry.twin import Twin, TwinSettings, fit_twin
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.blade.solid import slice_loops
+from geometry.damage.damages import find_damages
+from geometry.deformation.twin import Twin, TwinSettings, fit_twin
+from geometry.registration.register import Alignment
+from geometry.repair.patches import RepairSettings, find_repairs
 from geometry.types import Bools, Cloud, Floats, Mesh
 from tests.geometry import twin_blades as blades
 from tests.geometry.poses import in_place

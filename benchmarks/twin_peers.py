@@ -26,11 +26,11 @@ import trimesh
 from trimesh.registration import nricp_amberg, nricp_sumner
 
 from benchmarks import twin as study
-from geometry.damage import find_damages
-from geometry.nominal import Nominal
-from geometry.repair import RepairSettings, find_repairs
+from geometry.blade.nominal import Nominal
+from geometry.damage.damages import find_damages
+from geometry.deformation.twin import TwinSettings, fit_twin
+from geometry.repair.patches import RepairSettings, find_repairs
 from geometry.thesis.stiff_twin import ThesisTwinSettings, fit_twin_thesis
-from geometry.twin import TwinSettings, fit_twin
 from geometry.types import Floats
 from tests.geometry import twin_blades as blades
 from tests.geometry.poses import in_place

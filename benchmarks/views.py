@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import manifold3d
 import numpy as np
 
-from geometry.damage import DamageKind
+from geometry.damage.damages import DamageKind
 from geometry.errors import CannotMeasure
 from geometry.types import Mesh
 from simulators.damage_solids import DamageTruth, edge_nick, pit, tip_corner, tip_loss

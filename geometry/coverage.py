@@ -6,13 +6,13 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geometry.broken import Skin, frames_along
+from geometry.blade.nominal import ZONE_ORDER, Nominal
+from geometry.damage.broken import Skin, frames_along
+from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
-from geometry.nominal import ZONE_ORDER, Nominal
-from geometry.register import Alignment
-from geometry.repair import RepairVolume
+from geometry.registration.register import Alignment
+from geometry.repair.patches import RepairVolume
 from geometry.transforms import apply
-from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Ints, Mesh, Zone
 
 SAME_SIDE = 0.3  # least cosine between the direction of a side and the skin that a scan point lies on

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.calibrate import AxisCalibration, ball_places, calibrate_axis
 from geometry.errors import CannotMeasure
+from geometry.scan.calibrate import AxisCalibration, ball_places, calibrate_axis
 from geometry.types import Floats, Ints
 from station.clouds import BadScan, read_whole
 from station.config import read_calibration

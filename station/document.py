@@ -13,13 +13,13 @@ from geometry.types import Measurand, Measured, NotMeasured
 from station.software import software_commit, software_version
 
 if TYPE_CHECKING:
-    from geometry.airfoil import Section
-    from geometry.blade_line import BladeLine
     from geometry.coverage import ZoneCoverage
-    from geometry.damage import Damage
-    from geometry.datums import ServiceMotion
-    from geometry.register import Alignment
-    from geometry.repair import Patch
+    from geometry.damage.damages import Damage
+    from geometry.registration.datums import ServiceMotion
+    from geometry.registration.register import Alignment
+    from geometry.repair.patches import Patch
+    from geometry.sections.airfoil import Section
+    from geometry.sections.blade_line import BladeLine
     from station.findings import Finding
     from station.measurement import Measurement
     from station.plans import BladePlan

@@ -3,7 +3,7 @@
 This runs in the worker, beside the measurement; only small events travel.
 """
 
-from geometry.airfoil import Section
+from geometry.sections.airfoil import Section
 from geometry.types import Measurand, Measured
 from station.events import MAX_CLOUD_POINTS, CloudMeasured, SectionMeasured, Value, pack
 from station.measurement import Measurement, Outline

@@ -12,9 +12,9 @@ from geometry.types import Measurand, Measured, NotMeasured, Zone
 from station.plans import CountLimit, Limit, same_z
 
 if TYPE_CHECKING:
-    from geometry.airfoil import Section
-    from geometry.blade_line import Judged
-    from geometry.damage import Damage
+    from geometry.damage.damages import Damage
+    from geometry.sections.airfoil import Section
+    from geometry.sections.blade_line import Judged
     from station.measurement import Measurement
     from station.plans import BladePlan
 

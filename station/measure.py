@@ -13,19 +13,19 @@ from typing import TypeVar
 
 import numpy as np
 
-from geometry.airfoil import Section, with_damages
-from geometry.blade_line import blade_line
-from geometry.clean import CleanSettings, clean
+from geometry.blade.nominal import Nominal
 from geometry.coverage import measure_coverage
-from geometry.damage import Damage, DamageKind, DamageSettings, detection_limit, find_damages
+from geometry.damage.damages import Damage, DamageKind, DamageSettings, detection_limit, find_damages
+from geometry.deformation.twin import Twin
 from geometry.errors import CannotMeasure
-from geometry.fuse import fuse
-from geometry.nominal import Nominal
-from geometry.overlap import refine_axis
-from geometry.register import Alignment, mask_damage
-from geometry.repair import RepairVolume, find_repairs
+from geometry.registration.register import Alignment, mask_damage
+from geometry.repair.patches import RepairVolume, find_repairs
+from geometry.scan.clean import CleanSettings, clean
+from geometry.scan.fuse import fuse
+from geometry.scan.overlap import refine_axis
+from geometry.sections.airfoil import Section, with_damages
+from geometry.sections.blade_line import blade_line
 from geometry.transforms import apply
-from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Measured, NotMeasured, View, Zone
 from station.measurement import NO_TWIN, Measurement
 from station.methods import align, cut_sections, make_twin

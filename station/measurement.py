@@ -11,13 +11,13 @@ import numpy as np
 from geometry.types import Floats, Measured, NotMeasured, Zone
 
 if TYPE_CHECKING:  # the rooms behind these types are heavy, and who only judges or shows needs none of them
-    from geometry.airfoil import Section
-    from geometry.blade_line import BladeLine
     from geometry.coverage import ZoneCoverage
-    from geometry.damage import Damage
-    from geometry.datums import ServiceMotion
-    from geometry.register import Alignment
-    from geometry.repair import RepairVolume
+    from geometry.damage.damages import Damage
+    from geometry.registration.datums import ServiceMotion
+    from geometry.registration.register import Alignment
+    from geometry.repair.patches import RepairVolume
+    from geometry.sections.airfoil import Section
+    from geometry.sections.blade_line import BladeLine
     from geometry.types import Mesh
 
 NO_POINTS = np.empty((0, 3))

@@ -6,22 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.airfoil import Section, measure_sections
-from geometry.datums import (
+from geometry.blade.nominal import Nominal
+from geometry.deformation.twin import Twin, TwinSettings, fit_twin
+from geometry.errors import CannotFitTwin, CannotMeasure, CannotRegister
+from geometry.registration.datums import (
     ServiceMotion,
     register_root,
     register_sections,
     register_six_point,
     service_motion,
 )
-from geometry.errors import CannotFitTwin, CannotMeasure, CannotRegister
-from geometry.nominal import Nominal
-from geometry.register import Alignment, register
+from geometry.registration.register import Alignment, register
+from geometry.sections.airfoil import Section, measure_sections
 from geometry.thesis.fine_tuned import register_thesis
 from geometry.thesis.rwlls_sections import ThesisSectionSettings, measure_sections_thesis
 from geometry.thesis.stiff_twin import fit_twin_thesis
 from geometry.transforms import apply, inverse
-from geometry.twin import Twin, TwinSettings, fit_twin
 from geometry.types import Bools, Cloud, NotMeasured
 from station.plans import AlignmentChoice
 from station.recipe import Recipe

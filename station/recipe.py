@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.airfoil import SectionSettings
-from geometry.calibrate import AxisCalibration
-from geometry.chart import FitSettings
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
 from geometry.coverage import CoverageSettings
-from geometry.datums import DatumSettings
 from geometry.errors import BadInput
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
-from geometry.repair import RepairSettings
+from geometry.registration.datums import DatumSettings
+from geometry.repair.patches import RepairSettings
+from geometry.scan.calibrate import AxisCalibration
+from geometry.sections.airfoil import SectionSettings
+from geometry.sections.chart import FitSettings
 from geometry.types import Mesh
 from station.config import Calibration
 from station.formats.cad import is_cad, read_cad

@@ -17,7 +17,7 @@ from station.plots import Bar, Curve, SectionPlot, limit_bar, plot_section
 from station.tables import Row, rows
 
 if TYPE_CHECKING:
-    from geometry.airfoil import Section
+    from geometry.sections.airfoil import Section
     from station.measurement import Measurement
     from station.plans import BladePlan
     from station.verdict import Verdict

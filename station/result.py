@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geometry.repair import in_frame
+from geometry.repair.patches import in_frame
 from geometry.transforms import inverse
 from geometry.types import Mesh
 from station.document import Inputs, Json, document, document_text, patches_of
@@ -24,7 +24,7 @@ from station.report import render
 from station.tables import sections_csv
 
 if TYPE_CHECKING:
-    from geometry.repair import Patch
+    from geometry.repair.patches import Patch
     from station.measurement import Measurement
     from station.plans import BladePlan
     from station.verdict import Verdict

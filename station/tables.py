@@ -14,7 +14,7 @@ from station.findings import Finding, characteristic
 from station.plans import same_z
 
 if TYPE_CHECKING:
-    from geometry.airfoil import Section
+    from geometry.sections.airfoil import Section
     from station.measurement import Measurement
     from station.verdict import Verdict
 

@@ -26,8 +26,8 @@ from station.gates import ACCEPTANCE, Acceptance, Cause, Gates, Reason, alignmen
 
 if TYPE_CHECKING:
     from geometry.coverage import ZoneCoverage
-    from geometry.damage import Damage
-    from geometry.repair import Patch
+    from geometry.damage.damages import Damage
+    from geometry.repair.patches import Patch
     from station.measurement import Measurement
     from station.plans import BladePlan
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from geometry.types import Measurand, Measured
 
 if TYPE_CHECKING:
-    from geometry.airfoil import Section
-    from geometry.blade_line import BladeLine, Judged
-    from geometry.damage import Damage
-    from geometry.repair import Patch, RepairVolume
+    from geometry.damage.damages import Damage
+    from geometry.repair.patches import Patch, RepairVolume
+    from geometry.sections.airfoil import Section
+    from geometry.sections.blade_line import BladeLine, Judged
     from station.measurement import Measurement
 
 

@@ -15,7 +15,7 @@ LIGHT = {
     "drivers.wire.scanner": {"serial", "pymodbus", "asyncio"},
     "drivers.wire.plc": {"serial", "pymodbus", "asyncio"},
     "station.verdict": {"open3d", "textual", "pymodbus"},
-    "station.tui.app": {"open3d", "numba", "scipy", "pymodbus", "serial", "geometry.register"},
+    "station.tui.app": {"open3d", "numba", "scipy", "pymodbus", "serial", "geometry.registration.register"},
     "station.cycle": {"textual", "open3d"},
     "geometry.types": {"open3d", "numba", "pydantic"},
 }
@@ -63,7 +63,7 @@ def test_third_parties_are_fenced() -> None:
     fences = {
         "import serial": {"drivers/line.py"},
         "pymodbus": {"drivers/plc.py", "drivers/scanner.py", "simulators/plc.py", "simulators/scanner.py"},
-        "import open3d": {"geometry/nominal.py", "simulators/optics.py"},
+        "import open3d": {"geometry/blade/nominal.py", "simulators/optics.py"},
     }
     for word, allowed in fences.items():
         users = {

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from geometry.nominal import Nominal
-from geometry.offset import Nodes, scatter_nodes
-from geometry.solid import face_areas_mm2
-from geometry.surface import k_nearest
+from geometry.blade.nominal import Nominal
+from geometry.blade.solid import face_areas_mm2
+from geometry.deformation.offset import Nodes, scatter_nodes
+from geometry.scan.surface import k_nearest
 from geometry.types import Bools, Floats
 
 DRAWN = 10.0  # candidates for each square of the pitch

@@ -11,14 +11,14 @@ from itertools import product
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geometry.coarse import principal_frame
+from geometry.blade.nominal import Nominal
 from geometry.errors import BadInput, CannotRegister
-from geometry.fit import every, felt, information, solve_step
 from geometry.kernels.hausdorff import average_hausdorff
-from geometry.mask import robust_sigma
-from geometry.nominal import Nominal
-from geometry.register import Alignment
-from geometry.surface import local_shape, near_each_other
+from geometry.registration.coarse import principal_frame
+from geometry.registration.fit import every, felt, information, solve_step
+from geometry.registration.mask import robust_sigma
+from geometry.registration.register import Alignment
+from geometry.scan.surface import local_shape, near_each_other
 from geometry.thesis.cad_points import pitch_of, sample_cad
 from geometry.transforms import apply, inverse, rigid
 from geometry.types import Bools, Cloud, Floats, Ints

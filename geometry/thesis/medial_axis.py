@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from geometry.blade.nominal import Nominal, NominalSection
 from geometry.kernels.airfoil import inscribed_circles
-from geometry.nominal import Nominal, NominalSection
 from geometry.types import Floats
 
 CIRCLES = 200  # inscribed circles of a section

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geometry.blade.nominal import Closest, Nominal
 from geometry.errors import BadInput
 from geometry.kernels.graph import grow
-from geometry.nominal import Closest, Nominal
-from geometry.surface import local_shape
+from geometry.scan.surface import local_shape
 from geometry.thesis.fine_tuned import min_max
 from geometry.types import Bools, Floats
 

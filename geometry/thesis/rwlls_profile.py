@@ -12,11 +12,11 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from geometry.chart import outward_normals
 from geometry.errors import BadInput, CannotMeasure
 from geometry.kernels.quadric import balanced_quadrics
 from geometry.kernels.rwlls import blend_curves, grow_domains, pull_back
 from geometry.kernels.rwlls_spline import cubic_basis, fit_progressively
+from geometry.sections.chart import outward_normals
 from geometry.thesis.polygon import order_points
 from geometry.types import Floats, Ints
 

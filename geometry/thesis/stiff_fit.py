@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geometry.blade.nominal import Nominal
+from geometry.deformation.offset import Nodes
 from geometry.errors import BadInput, CannotFitTwin
 from geometry.kernels.stiff_quadric import feet_on_quadrics, fit_quadrics
 from geometry.kernels.stiff_sheet import crosses_sheet
-from geometry.nominal import Nominal
-from geometry.offset import Nodes
 from geometry.thesis.cad_points import pitch_of, sample_cad
 from geometry.thesis.medial_axis import medial_sheet
 from geometry.thesis.region_growing import RegionGrowingSettings

@@ -3,16 +3,17 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geometry.broken import Skin
+from geometry.blade.nominal import Nominal
+from geometry.blade.solid import solid_normals
+from geometry.damage.broken import Skin
+from geometry.deformation.offset import Nodes
+from geometry.deformation.refine import Refined, refine
+from geometry.deformation.twin import Twin
 from geometry.errors import CannotFitTwin
 from geometry.kernels.stiff_quadric import TERMS
 from geometry.kernels.thinplate import linear_weights
-from geometry.mask import robust_sigma
-from geometry.nominal import Nominal
-from geometry.offset import Nodes
-from geometry.refine import Refined, refine
-from geometry.register import Alignment, variance_along
-from geometry.solid import solid_normals
+from geometry.registration.mask import robust_sigma
+from geometry.registration.register import Alignment, variance_along
 from geometry.thesis.region_growing import grow_damage
 from geometry.thesis.stiff_fit import (
     CANDIDATES,
@@ -32,7 +33,6 @@ from geometry.thesis.stiff_fit import (
 )
 from geometry.thesis.stiffness import Stiffness
 from geometry.transforms import apply
-from geometry.twin import Twin
 from geometry.types import Bools, Cloud, Floats, Measurand, Measured, Mesh, NotMeasured
 
 __all__ = ["ThesisTwinSettings", "fit_twin_thesis"]

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from geometry.blade.solid import check_solid, merge_vertices
 from geometry.errors import BadInput, BadMesh
-from geometry.solid import check_solid, merge_vertices
 from geometry.types import Mesh
 
 KINDS = {".step": "step", ".stp": "step", ".iges": "iges", ".igs": "iges"}

@@ -11,8 +11,8 @@ from functools import cache
 
 import numpy as np
 
-from geometry.nominal import Nominal, NominalSection
-from geometry.register import Alignment
+from geometry.blade.nominal import Nominal, NominalSection
+from geometry.registration.register import Alignment
 from geometry.types import Cloud, Floats, Ints
 from tests.geometry.poses import in_place
 

@@ -7,17 +7,17 @@ from time import process_time
 
 import numpy as np
 
-from geometry.broken import Skin
-from geometry.calibrate import AxisCalibration
-from geometry.clean import clean
-from geometry.damage import Damage, find_damages
-from geometry.fit import Fit, felt, fit_kept
-from geometry.fuse import fuse
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.register import Alignment, mask_damage, register
-from geometry.repair import RepairSettings, RepairVolume, find_repairs
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.damage.broken import Skin
+from geometry.damage.damages import Damage, find_damages
+from geometry.deformation.twin import Twin, TwinSettings, fit_twin
+from geometry.registration.fit import Fit, felt, fit_kept
+from geometry.registration.register import Alignment, mask_damage, register
+from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
+from geometry.scan.calibrate import AxisCalibration
+from geometry.scan.clean import clean
+from geometry.scan.fuse import fuse
 from geometry.transforms import apply, inverse
-from geometry.twin import Twin, TwinSettings, fit_twin
 from geometry.types import Bools, Cloud, Floats, Mesh, View
 from simulators.calibration_file import SIGMA_AXIS_OFFSET_MM, SIGMA_AXIS_TILT_DEG, calibrated_axis
 from simulators.damage_solids import Cut

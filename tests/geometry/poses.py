@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from geometry.register import Alignment
+from geometry.registration.register import Alignment
 from geometry.types import Floats
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from geometry.damage import Damage, DamageKind
-from geometry.register import Alignment
-from geometry.twin import Twin
+from geometry.damage.damages import Damage, DamageKind
+from geometry.deformation.twin import Twin
+from geometry.registration.register import Alignment
 from geometry.types import Cloud, Measurand, Mesh, NotMeasured, Zone
 from tests.geometry.poses import in_place
 

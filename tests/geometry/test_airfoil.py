@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from geometry.airfoil import (
+from geometry.sections.airfoil import (
     SECTION_MEASURANDS,
     SectionStatus,
     measure_sections,
     with_damages,
 )
-from geometry.chart import SectionSettings, outward_normals, unroll
-from geometry.measurands import define, form, place, shape
+from geometry.sections.chart import SectionSettings, outward_normals, unroll
+from geometry.sections.measurands import define, form, place, shape
 from geometry.transforms import exp
 from geometry.types import Cloud, Measurand, NotMeasured
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part, alignment, cloud_of, section_of

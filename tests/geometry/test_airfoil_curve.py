@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from geometry.chart import NODES, SectionSettings, outward_normals, unroll
-from geometry.chords import chord
-from geometry.curve import (
+from geometry.errors import CannotMeasure
+from geometry.kernels.airfoil import closed_normals, closed_steps, farthest_pair, inscribed_circles
+from geometry.sections.chart import NODES, SectionSettings, outward_normals, unroll
+from geometry.sections.chords import chord
+from geometry.sections.curve import (
     area,
     camber_line,
     centroid,
@@ -19,8 +21,6 @@ from geometry.curve import (
     thick_part,
     thickness,
 )
-from geometry.errors import CannotMeasure
-from geometry.kernels.airfoil import closed_normals, closed_steps, farthest_pair, inscribed_circles
 from tests.geometry.airfoils import AnalyticNominal, Blade, DiscAirfoil, random_airfoil
 
 A, B = 20.0, 4.0

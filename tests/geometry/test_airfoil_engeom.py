@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geometry.curve import camber_line, edge, edge_radius, thick_part, thickness
+from geometry.sections.curve import camber_line, edge, edge_radius, thick_part, thickness
 from tests.geometry.airfoils import DiscAirfoil
 
 engeom_airfoil = pytest.importorskip("engeom.airfoil2", reason="engeom is a benchmark extra")

@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from geometry.band import band_of
-from geometry.chart import Motion, SectionSettings, curvature, rigid_columns, unroll
-from geometry.curve import centroid
 from geometry.kernels.profile import (
     band_bins,
     band_misfit,
@@ -16,7 +13,10 @@ from geometry.kernels.profile import (
     tensor_values,
 )
 from geometry.kernels.profile_spline import curvature_penalty, gather, solve, stencil
-from geometry.profile import Scan, reconstruct
+from geometry.sections.band import band_of
+from geometry.sections.chart import Motion, SectionSettings, curvature, rigid_columns, unroll
+from geometry.sections.curve import centroid
+from geometry.sections.profile import Scan, reconstruct
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part
 
 P, Q = 16, 5

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geometry.airfoil import Section, SectionStatus, Stacking
-from geometry.blade_line import blade_line
 from geometry.errors import BadInput
+from geometry.sections.airfoil import Section, SectionStatus, Stacking
+from geometry.sections.blade_line import blade_line
 from geometry.types import Measurand, NotMeasured
 from tests.geometry import airfoils
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.calibrate import AxisCalibration, calibrate_axis, find_sphere
 from geometry.errors import BadInput, CannotMeasure
+from geometry.scan.calibrate import AxisCalibration, calibrate_axis, find_sphere
 from geometry.transforms import about_z, apply, inverse, rigid
 
 T_SCANNER_TABLE = rigid(

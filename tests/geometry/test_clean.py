@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from geometry.clean import CleanSettings, clean
 from geometry.errors import BadInput
 from geometry.kernels.neighbours import k_nearest
-from geometry.neighbourhood import nearest_of
+from geometry.scan.clean import CleanSettings, clean
+from geometry.scan.neighbourhood import nearest_of
 from geometry.types import Cloud
 from tests.geometry import blades
 

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from geometry.broken import Skin
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.coverage import CoverageSettings, CoverageStatus, ZoneCoverage, measure_coverage
+from geometry.damage.broken import Skin
 from geometry.errors import BadInput
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.repair import RepairSettings, RepairVolume, find_repairs
+from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
 from geometry.types import Bools, Mesh, Zone
 from tests.geometry import repair_blades as blades
 

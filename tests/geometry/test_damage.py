@@ -4,8 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from geometry.damage import Damage, DamageKind, detection_limit, find_damages
-from geometry.twin import TwinSettings, fit_twin
+from geometry.damage.damages import Damage, DamageKind, detection_limit, find_damages
+from geometry.deformation.twin import TwinSettings, fit_twin
 from geometry.types import Bools, Measurand, Zone
 from tests.geometry import twin_blades as blades
 from tests.geometry.airfoils import cloud_of

@@ -6,8 +6,8 @@ import manifold3d
 import numpy as np
 import pytest
 
-from geometry.damage import Damage, find_damages
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.damage.damages import Damage, find_damages
 from geometry.types import Measurand, Measured, Zone
 from tests.geometry import repair_blades as blades
 

@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from geometry.damage import HOLLOW_SPACINGS, Damage, detection_limit, find_damages
-from geometry.twin import TwinSettings, fit_twin
+from geometry.damage.damages import HOLLOW_SPACINGS, Damage, detection_limit, find_damages
+from geometry.deformation.twin import TwinSettings, fit_twin
 from geometry.types import Bools, Floats, Measurand, Zone
 from tests.geometry import twin_blades as blades
 from tests.geometry.airfoils import cloud_of

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.datums import (
+from geometry.blade.nominal import NominalSettings, prepare_nominal
+from geometry.errors import BadInput, CannotRegister
+from geometry.registration.datums import (
     SIX,
     DatumSettings,
     register_root,
@@ -15,9 +17,7 @@ from geometry.datums import (
     register_six_point,
     service_motion,
 )
-from geometry.errors import BadInput, CannotRegister
-from geometry.nominal import NominalSettings, prepare_nominal
-from geometry.register import Alignment
+from geometry.registration.register import Alignment
 from geometry.transforms import apply, exp, inverse, log, rigid
 from geometry.types import Cloud
 from tests.geometry import blades

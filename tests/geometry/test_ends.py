@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from geometry.ends import on_rim, rims, scan_ends
-from geometry.nominal import NominalSettings, prepare_nominal
-from geometry.register import register
+from geometry.blade.nominal import NominalSettings, prepare_nominal
+from geometry.registration.ends import on_rim, rims, scan_ends
+from geometry.registration.register import register
 from geometry.transforms import apply, inverse, rigid
 from geometry.types import Cloud
 from tests.geometry import blades

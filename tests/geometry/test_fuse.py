@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.calibrate import AxisCalibration
 from geometry.errors import CannotMeasure
-from geometry.fuse import fuse
+from geometry.scan.calibrate import AxisCalibration
+from geometry.scan.fuse import fuse
 from geometry.transforms import about_z, apply, rigid
 from geometry.types import View
 from tests.geometry import blades

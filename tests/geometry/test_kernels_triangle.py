@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from geometry.blade.solid import faces_around, solid_normals
 from geometry.kernels.triangle import closest_on_triangles, describe_feet, refine_closest
-from geometry.solid import faces_around, solid_normals
 from tests.geometry import blades
 
 

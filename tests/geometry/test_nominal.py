@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from geometry.blade.nominal import ZONE_ORDER, NominalSettings, prepare_nominal, read_nominal
+from geometry.blade.solid import check_solid, volume_mm3
 from geometry.errors import BadInput, BadMesh
-from geometry.nominal import ZONE_ORDER, NominalSettings, prepare_nominal, read_nominal
-from geometry.solid import check_solid, volume_mm3
 from geometry.types import Mesh, Zone
 from tests.geometry import blades
 

@@ -7,7 +7,7 @@ import pytest
 
 from geometry.errors import CannotMeasure
 from geometry.kernels.overlap import heights_over_others
-from geometry.overlap import refine_axis
+from geometry.scan.overlap import refine_axis
 from geometry.transforms import about_z, exp, inverse, log, rigid
 from geometry.types import Floats, View
 from tests.geometry.test_fuse import AXIS, views

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from geometry.chart import NODES, SectionSettings, find_motion, outward_normals, unroll
 from geometry.errors import BadInput, CannotMeasure
-from geometry.profile import Gap, Scan, find_gaps, reconstruct
+from geometry.sections.chart import NODES, SectionSettings, find_motion, outward_normals, unroll
+from geometry.sections.profile import Gap, Scan, find_gaps, reconstruct
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part
 
 SETTINGS = SectionSettings()

@@ -5,7 +5,7 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from geometry.solid import check_solid
+from geometry.blade.solid import check_solid
 from geometry.transforms import apply, inverse
 from geometry.types import Zone
 from simulators.damage_solids import Cut, edge_nick, pit

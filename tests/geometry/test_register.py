@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.coarse import CoarseSettings
+from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.errors import BadInput, CannotRegister
-from geometry.fit import Fit, fit_kept, information
-from geometry.nominal import NominalSettings, prepare_nominal
-from geometry.register import RegisterSettings, mask_damage, register
+from geometry.registration.coarse import CoarseSettings
+from geometry.registration.fit import Fit, fit_kept, information
+from geometry.registration.register import RegisterSettings, mask_damage, register
 from geometry.transforms import apply, check_rigid, inverse, log, rigid
 from geometry.types import Cloud
 from tests.geometry import blades

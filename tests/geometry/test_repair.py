@@ -7,10 +7,11 @@ import manifold3d
 import numpy as np
 import pytest
 
-import geometry.repair as repair_module
-from geometry.damage import DamageKind
+import geometry.repair.patches as repair_module
+from geometry.blade.solid import solid_normals
+from geometry.damage.damages import DamageKind
 from geometry.errors import BadInput
-from geometry.repair import (
+from geometry.repair.patches import (
     Patch,
     RepairSettings,
     RepairVolume,
@@ -19,7 +20,6 @@ from geometry.repair import (
     to_scan_frame,
     with_allowance,
 )
-from geometry.solid import solid_normals
 from geometry.transforms import apply, exp, inverse, rigid
 from geometry.types import Cloud, Measurand, Mesh, Zone
 from tests.geometry import repair_blades as blades

@@ -3,7 +3,7 @@
 import manifold3d
 import numpy as np
 
-from geometry.broken import Skin, frames_along
+from geometry.damage.broken import Skin, frames_along
 from geometry.kernels.implicit import blend_quadrics
 from geometry.kernels.implicit_solid import column_crossings, nodes_inside
 from geometry.types import Floats, Mesh

@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from geometry.airfoil import measure_sections
-from geometry.chart import NODES, SectionSettings, unroll
-from geometry.measurands import define
-from geometry.profile import cover_zones
+from geometry.sections.airfoil import measure_sections
+from geometry.sections.chart import NODES, SectionSettings, unroll
+from geometry.sections.measurands import define
+from geometry.sections.profile import cover_zones
 from geometry.types import Measurand, NotMeasured
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part, cloud_of
 from tests.geometry.test_airfoil import alignment

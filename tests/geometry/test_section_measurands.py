@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from geometry.camber import max_camber, thickest_at
-from geometry.chart import NODES, FitSettings, SectionSettings, outward_normals, unroll
-from geometry.chords import chord, hollow, nose_tail_chord, tangent_chord
-from geometry.curve import camber_line, centroid, edge, node_arc, node_shares, thick_part, thickness
-from geometry.edge_shape import flat, min_radius
 from geometry.errors import BadInput, CannotMeasure
-from geometry.form import share_beyond, share_beyond_sigma, wave_band
-from geometry.measurands import SECTION_MEASURANDS, define, section_measurands, shape
-from geometry.section_fit import best_fit
+from geometry.sections.camber import max_camber, thickest_at
+from geometry.sections.chart import NODES, FitSettings, SectionSettings, outward_normals, unroll
+from geometry.sections.chords import chord, hollow, nose_tail_chord, tangent_chord
+from geometry.sections.curve import camber_line, centroid, edge, node_arc, node_shares, thick_part, thickness
+from geometry.sections.edge_shape import flat, min_radius
+from geometry.sections.form import share_beyond, share_beyond_sigma, wave_band
+from geometry.sections.measurands import SECTION_MEASURANDS, define, section_measurands, shape
+from geometry.sections.section_fit import best_fit
 from tests.geometry.airfoils import AnalyticNominal, Blade, DiscAirfoil
 
 NOSE = NODES // 2

@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from geometry.nominal import NominalSettings, prepare_nominal
-from geometry.register import register
-from geometry.slide import slides_mm
+from geometry.blade.nominal import NominalSettings, prepare_nominal
+from geometry.registration.register import register
+from geometry.registration.slide import slides_mm
 from geometry.transforms import apply, inverse, rigid
 from geometry.types import Cloud
 from tests.geometry import blades

@@ -5,7 +5,7 @@ import pytest
 
 from geometry.errors import BadInput
 from geometry.kernels.quadric import plane_heights
-from geometry.surface import k_nearest, local_shape
+from geometry.scan.surface import k_nearest, local_shape
 
 
 def sphere(count, radius, rng):

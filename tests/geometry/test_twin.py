@@ -8,11 +8,11 @@ import manifold3d
 import numpy as np
 import pytest
 
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
+from geometry.blade.solid import check_solid
+from geometry.deformation.twin import Twin, TwinSettings, fit_twin
 from geometry.errors import CannotFitTwin
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
-from geometry.solid import check_solid
 from geometry.transforms import apply, exp, inverse
-from geometry.twin import Twin, TwinSettings, fit_twin
 from geometry.types import Bools, Floats, Measurand, Mesh
 from tests.geometry import twin_blades as blades
 from tests.geometry.airfoils import cloud_of

@@ -6,15 +6,30 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from geometry.freeform import Lattice, lattice_over
+from geometry.blade.solid import check_solid, solid_normals, volume_mm3
+from geometry.deformation.freeform import Lattice, lattice_over
+from geometry.deformation.kriging import (
+    AFFINE,
+    Prior,
+    Sample,
+    fit_wear,
+    likeliest_prior,
+    sample_of,
+    typical_prior,
+)
+from geometry.deformation.offset import (
+    BENDING_REACH,
+    BENDING_WIDTH,
+    Nodes,
+    bending_energy,
+    fit_offset,
+    scatter_nodes,
+)
+from geometry.deformation.refine import refine
 from geometry.kernels.covariance import TURN as ALIKE
 from geometry.kernels.covariance import carried, covariance, covariance_slopes, joint_covariance
 from geometry.kernels.ffd import evaluate
 from geometry.kernels.thinplate import TURN
-from geometry.kriging import AFFINE, Prior, Sample, fit_wear, likeliest_prior, sample_of, typical_prior
-from geometry.offset import BENDING_REACH, BENDING_WIDTH, Nodes, bending_energy, fit_offset, scatter_nodes
-from geometry.refine import refine
-from geometry.solid import check_solid, solid_normals, volume_mm3
 from geometry.types import Floats, Mesh
 
 

@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from geometry.fit import Fit, fit_kept, information
-from geometry.nominal import NominalSettings, prepare_nominal
+from geometry.blade.nominal import NominalSettings, prepare_nominal
+from geometry.registration.fit import Fit, fit_kept, information
+from geometry.registration.uncertainty import certainty, form_covariance
 from geometry.transforms import apply, log
-from geometry.uncertainty import certainty, form_covariance
 from tests.geometry import blades
 
 BLADE = blades.Blade()

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from geometry.airfoil import Section, SectionStatus
 from geometry.coverage import CoverageStatus, ZoneCoverage
-from geometry.damage import Damage, DamageKind
-from geometry.register import Alignment
-from geometry.repair import Patch, RepairVolume
+from geometry.damage.damages import Damage, DamageKind
+from geometry.registration.register import Alignment
+from geometry.repair.patches import Patch, RepairVolume
+from geometry.sections.airfoil import Section, SectionStatus
 from geometry.types import Measurand, Measured, Mesh, NotMeasured, Zone
 from station.gates import Gate, Gates
 from station.measurement import Measurement, Outline

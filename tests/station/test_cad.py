@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.errors import BadMesh
-from geometry.nominal import NominalSettings, prepare_nominal
 from geometry.types import Floats, Mesh
 from station.formats import cad
 from station.formats.cad import is_cad, read_cad

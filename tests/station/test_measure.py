@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from geometry.airfoil import SectionStatus
-from geometry.calibrate import AxisCalibration
-from geometry.damage import DamageKind
+from geometry.damage.damages import DamageKind
 from geometry.errors import CannotMeasure
-from geometry.overlap import Overlap, RefinedAxis
+from geometry.scan.calibrate import AxisCalibration
+from geometry.scan.overlap import Overlap, RefinedAxis
+from geometry.sections.airfoil import SectionStatus
 from geometry.types import Cloud, Measurand, NotMeasured, View, Zone
 from station import measure
 from station.gates import Acceptance

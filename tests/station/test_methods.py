@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from geometry.chart import SectionSettings
-from geometry.datums import ServiceMotion
 from geometry.errors import CannotFitTwin, CannotRegister
+from geometry.registration.datums import ServiceMotion
+from geometry.sections.chart import SectionSettings
 from geometry.transforms import about_z, rigid
 from geometry.types import NotMeasured
 from station import methods

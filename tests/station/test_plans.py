@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geometry.chart import SectionSettings
-from geometry.measurands import section_measurands
+from geometry.sections.chart import SectionSettings
+from geometry.sections.measurands import section_measurands
 from geometry.types import Zone
 from station.plans import SECTION_KEYS, BadPlan, BladePlan, check_span, read_plan
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geometry.blade_line import BladeLine, Judged, RelativeTwist
-from geometry.damage import DamageKind
+from geometry.damage.damages import DamageKind
+from geometry.sections.blade_line import BladeLine, Judged, RelativeTwist
 from geometry.types import Zone
 from station.findings import Finding, Outcome, described, outcome_of
 from station.gates import Acceptance, Cause, Gate

@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geometry.coarse import CoarseSettings, find_pose
+from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.errors import BadInput, CannotRegister
 from geometry.kernels.hausdorff import average_hausdorff
-from geometry.nominal import NominalSettings, prepare_nominal
+from geometry.registration.coarse import CoarseSettings, find_pose
 from geometry.thesis.cad_points import pitch_of, sample_cad
 from geometry.thesis.fine_tuned import (
     ThesisRegisterSettings,

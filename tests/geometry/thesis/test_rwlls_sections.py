@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from geometry.airfoil import SectionStatus, with_damages
-from geometry.chart import SectionSettings, unroll
-from geometry.measurands import define, form, place, shape
+from geometry.sections.airfoil import SectionStatus, with_damages
+from geometry.sections.chart import SectionSettings, unroll
+from geometry.sections.measurands import define, form, place, shape
 from geometry.thesis.rwlls_sections import ThesisSectionSettings, measure_sections_thesis
 from geometry.transforms import exp
 from geometry.types import Measurand, NotMeasured

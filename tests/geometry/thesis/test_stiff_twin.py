@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.blade.solid import check_solid
+from geometry.deformation.twin import Twin
 from geometry.errors import BadInput, CannotFitTwin
 from geometry.kernels.stiff_quadric import feet_on_quadrics, fit_quadrics
 from geometry.kernels.stiff_sheet import crosses_sheet
 from geometry.kernels.stiff_system import apply_system, relax
-from geometry.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.solid import check_solid
-from geometry.surface import local_shape
+from geometry.scan.surface import local_shape
 from geometry.thesis.medial_axis import medial_sheet
 from geometry.thesis.region_growing import RegionGrowingSettings, geometric_error, grow_damage
 from geometry.thesis.stiff_twin import ThesisTwinSettings, fit_twin_thesis
 from geometry.thesis.stiffness import factor_patches, prepare_stiffness, solve_stiff
-from geometry.twin import Twin
 from geometry.types import Bools, Floats, Measurand, Mesh
 from tests.geometry import twin_blades as blades
 from tests.geometry.airfoils import cloud_of

@@ -141,7 +141,7 @@ async def test_keys_send_intents_and_the_stream_is_followed() -> None:
 
 
 def test_the_screen_is_light() -> None:
-    heavy = "{'geometry.register', 'open3d', 'numba', 'scipy', 'pymodbus', 'serial', 'drivers.turntable'}"
+    heavy = "{'geometry.registration.register', 'open3d', 'numba', 'scipy', 'pymodbus', 'serial'}"
     code = f"import station.tui.app, sys; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True

@@ -1,0 +1,267 @@
+"""Damage regions of the scan against the twin: zone, kind, depth, area."""
+
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geometry.blade.nominal import ZONE_ORDER, Nominal
+from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
+from geometry.damage.regions import Field, Region, RegionSettings, find_regions, stand_off
+from geometry.deformation.twin import Twin
+from geometry.registration.register import Alignment
+from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone
+
+PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
+NOT_AN_EDGE = NotMeasured(reason="no loss of an edge")
+NOT_SOUGHT = NotMeasured(reason="was not looked for")
+ALONE = NotMeasured(reason="no other damage")
+HOLLOW_SPACINGS = 12.0  # width of the hollow, in point spacings, that the detection limit is stated for
+KEPT = 0.8  # of the depth of such a hollow is left in the mean over a neighbourhood
+PRECEDENCE = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
+
+
+class DamageKind(StrEnum):
+    MISSING = "missing"
+    EXCESS = "excess"
+    DEFORMATION = "deformation"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Damage:
+    """One damage, nominal frame. Depth: tip along the span from the twin's tip; edges in the
+    section plane from the twin's edge; surface normal to the twin. A volume that could not be
+    proven is `NotMeasured`, and so is a depth."""
+
+    zone: Zone
+    kind: DamageKind
+    depth_mm: Measured
+    area_mm2: Measured  # of the lost skin
+    volume_mm3: Measured
+    length_mm: float  # largest extent
+    centroid_mm: Floats  # (3,)
+    points: Ints  # indices of the scan points on the damaged surface
+    remaining_chord_mm: Measured = NOT_AN_EDGE  # least, of a section there
+    above_root_mm: Measured = NOT_SOUGHT  # its lowest point over z_min
+    spacing_mm: Measured = ALONE  # straight to the nearest other damage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DamageSettings:
+    regions: RegionSettings = field(default_factory=RegionSettings)
+    touching: float = 0.03  # share of a damage that must lie in a zone for the damage to touch it
+    alike: float = 0.35  # least ratio of sizes of the two sides of a bent region
+    beside_mm: float = 6.0  # how near those sides lie: about the thickness of an airfoil
+
+
+def find_damages(
+    cloud: Cloud,
+    mask: Bools,
+    alignment: Alignment,
+    nominal: Nominal,
+    twin: Twin,
+    settings: DamageSettings = DamageSettings(),
+) -> tuple[Damage, ...]:
+    """The damages of the airfoil, largest first.
+
+    A damage is connected metal that lies off the twin by more than noise and twin allow. What is missing and
+    in excess side by side, in like amounts, is one bent region. `mask` is not needed to find them: damage is
+    told against the twin, not against the nominal.
+    """
+    found = stand_off(cloud, alignment, nominal, twin, settings.regions)
+    regions = find_regions(found, nominal, settings.regions)
+    bent, single = _bent_pairs(regions, found, settings)
+    damages = [_described(region, found, nominal, twin, settings) for region in single]
+    damages += [_bent(a, b, found, nominal, settings) for a, b in bent]
+    return _spaced(damages, found)
+
+
+def detection_limit(
+    cloud: Cloud, twin: Twin, settings: DamageSettings = DamageSettings()
+) -> dict[Zone, Measured]:
+    """The depth per zone that is found with 95 % probability at the noise and density of this scan.
+
+    Stated for a hollow that runs out smoothly over `HOLLOW_SPACINGS`; a narrower one must be deeper. It is
+    found when the mean over a neighbourhood, which flattens it, passes `high` sigmas; it must exceed that by
+    the quantile of the noise of one such mean. At a tip or an edge the loss must also reach past the spacing
+    of the points, for metal between two points is not seen to be missing.
+    """
+    regions = settings.regions
+    noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
+    mean_mm = max(noise_mm / np.sqrt(regions.neighbours + 1), regions.floor_mm)
+    if not twin.supported.any():
+        return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
+    sigma_mm = float(np.hypot(mean_mm, np.quantile(twin.sigma_mm[twin.supported], 0.95)))
+    normal_mm = (regions.high + PROBABLE) * sigma_mm / KEPT
+    spacing_mm = _spacing_mm(cloud)
+    along_mm = {Zone.TIP: spacing_mm, Zone.LEADING_EDGE: spacing_mm, Zone.TRAILING_EDGE: spacing_mm}
+    return {
+        zone: Measurand(
+            name=f"{zone}_detection",
+            value=float(np.hypot(normal_mm, along_mm.get(zone, 0.0))),
+            sigma=0.0,
+            unit="mm",
+        )
+        for zone in PRECEDENCE
+    }
+
+
+def _spacing_mm(cloud: Cloud) -> float:
+    """Spacing of neighbouring points of the cloud."""
+    few = cloud.points_mm[:: max(1, len(cloud) // 5000)]
+    distance_mm = np.asarray(cKDTree(cloud.points_mm).query(few, 9)[0])
+    return float(np.median(distance_mm[:, -1]) * np.sqrt(np.pi / 8.0))
+
+
+def _bent_pairs(
+    regions: list[Region], found: Field, settings: DamageSettings
+) -> tuple[list[tuple[Region, Region]], list[Region]]:
+    """Pairs of a missing and an excess region side by side in like amounts, and the regions left over."""
+    free = list(regions)
+    pairs = []
+    for missing in [region for region in regions if region.missing and not len(region.lost)]:
+        mates = [
+            region for region in free if not region.missing and _mirror(missing, region, found, settings)
+        ]
+        if mates:
+            pairs.append((missing, mates[0]))
+            free.remove(missing)
+            free.remove(mates[0])
+    return pairs, free
+
+
+def _mirror(missing: Region, excess: Region, found: Field, settings: DamageSettings) -> bool:
+    """Whether two regions are the two sides of bent metal: as large, as far off, and near each other."""
+    sizes = [float(len(region.points)) for region in (missing, excess)]
+    heights = [float(np.abs(found.smooth_mm[region.points]).max()) for region in (missing, excess)]
+    if min(sizes) < settings.alike * max(sizes) or min(heights) < settings.alike * max(heights):
+        return False
+    nearest_mm, _ = cKDTree(found.scan_mm[excess.points]).query(found.scan_mm[missing.points])
+    return bool(np.median(nearest_mm) <= settings.beside_mm)
+
+
+def _described(
+    region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings
+) -> Damage:
+    body_mm = np.concatenate([found.scan_mm[region.points], found.skin_mm[region.lost]])
+    zone = _zone(region, found, nominal, settings.touching)
+    lowest = lowest_mm(region, found, twin)
+    loss = _loss(region, found, nominal, twin, zone, lowest)
+    return Damage(
+        zone=zone,
+        kind=DamageKind.MISSING if region.missing else DamageKind.EXCESS,
+        depth_mm=loss.depth_mm,
+        area_mm2=_area(region, found, nominal),
+        volume_mm3=_volume(region, found),
+        length_mm=_length_mm(body_mm),
+        centroid_mm=body_mm.mean(axis=0),
+        points=region.points,
+        remaining_chord_mm=loss.remaining_chord_mm,
+        above_root_mm=_above_root(lowest, nominal),
+    )
+
+
+def _loss(
+    region: Region, found: Field, nominal: Nominal, twin: Twin, zone: Zone, lowest: Measured
+) -> EdgeLoss:
+    """The depth of a damage by the rule of its zone, and the chord left where that is an edge."""
+    if region.missing and zone in (Zone.LEADING_EDGE, Zone.TRAILING_EDGE):
+        return edge_loss(region, found, nominal, twin, zone)
+    if region.missing and zone is Zone.TIP:
+        return EdgeLoss(depth_mm=_tip_depth(lowest, found, nominal), remaining_chord_mm=NOT_AN_EDGE)
+    return EdgeLoss(depth_mm=normal_depth(region, found), remaining_chord_mm=NOT_AN_EDGE)
+
+
+def _tip_depth(lowest: Measured, found: Field, nominal: Nominal) -> Measured:
+    tip_face = nominal.samples.tip_face
+    if not tip_face.any():
+        return NotMeasured(reason="the span ends short of the tip")
+    return span_depth(float(found.skin_mm[tip_face, 2].mean()), lowest)
+
+
+def _above_root(lowest: Measured, nominal: Nominal) -> Measured:
+    if isinstance(lowest, NotMeasured):
+        return lowest
+    return replace(lowest, name="above_root", value=lowest.value - nominal.z_min_mm)
+
+
+def _spaced(damages: list[Damage], found: Field) -> tuple[Damage, ...]:
+    """The damages, each with its distance to the nearest other one."""
+    if len(damages) < 2:
+        return tuple(damages)
+    trees = [cKDTree(found.scan_mm[damage.points]) for damage in damages]
+    return tuple(
+        replace(damage, spacing_mm=_spacing(own, [tree for tree in trees if tree is not own], found))
+        for damage, own in zip(damages, trees, strict=True)
+    )
+
+
+def _spacing(own: cKDTree, others: list[cKDTree], found: Field) -> Measurand:
+    """Distance to the nearest of the other damages; both borders lie within half a point spacing."""
+    apart_mm = min(float(np.min(own.query(other.data)[0])) for other in others)
+    sigma_mm = found.spacing_mm / np.sqrt(6.0)
+    return Measurand(name="spacing", value=apart_mm, sigma=float(sigma_mm), unit="mm")
+
+
+def _bent(
+    missing: Region, excess: Region, found: Field, nominal: Nominal, settings: DamageSettings
+) -> Damage:
+    """The damage of a bent region, from both its sides."""
+    points = np.sort(np.concatenate([missing.points, excess.points]))
+    both = Region(points=points, lost=np.zeros(0, np.int64), missing=True)
+    deeper = max((missing, excess), key=lambda side: float(np.abs(found.smooth_mm[side.points]).max()))
+    return Damage(
+        zone=_zone(both, found, nominal, settings.touching),
+        kind=DamageKind.DEFORMATION,
+        depth_mm=normal_depth(deeper, found),
+        area_mm2=_area(both, found, nominal),
+        volume_mm3=NotMeasured(reason="bent metal is neither missing nor in excess"),
+        length_mm=_length_mm(found.scan_mm[points]),
+        centroid_mm=found.scan_mm[points].mean(axis=0),
+        points=points,
+    )
+
+
+def _zone(region: Region, found: Field, nominal: Nominal, touching: float) -> Zone:
+    """The first zone in the order tip, leading edge, trailing edge, surface that the damage touches."""
+    codes = np.concatenate([nominal.zone_of(found.scan_mm[region.points]), nominal.samples.zone[region.lost]])
+    weight = np.concatenate(
+        [
+            np.full(len(region.points), found.spacing_mm**2),
+            nominal.samples.area_mm2[region.lost],
+        ]
+    )
+    share = np.bincount(codes, weight, len(ZONE_ORDER)) / weight.sum()
+    for zone in PRECEDENCE:
+        if share[ZONE_ORDER.index(zone)] > touching:
+            return zone
+    return Zone.OUTSIDE
+
+
+def _area(region: Region, found: Field, nominal: Nominal) -> Measurand:
+    """Area of the skin that the damage has taken: bare skin, which begins half a point spacing inside the
+    border, or where the break lies close beneath, that of the points on it."""
+    bare_mm2 = float(nominal.samples.area_mm2[region.lost].sum())
+    points_mm2 = len(region.points) * found.spacing_mm**2
+    strip_mm2 = 2.0 * np.sqrt(max(bare_mm2, points_mm2)) * found.spacing_mm  # along four equal sides
+    value = bare_mm2 + strip_mm2 if bare_mm2 > 0.5 * points_mm2 else points_mm2
+    return Measurand(name="area", value=float(value), sigma=float(strip_mm2), unit="mm2")
+
+
+def _volume(region: Region, found: Field) -> Measured:
+    """Volume between the points and the twin where the points lie close under or over the skin."""
+    if len(region.lost):
+        return NotMeasured(reason="from its patch")
+    depth_mm = np.abs(found.smooth_mm[region.points])
+    share_mm2 = found.spacing_mm**2
+    sigma = len(depth_mm) * share_mm2 * float(np.median(found.sigma_mm[region.points]))
+    value = float(depth_mm.sum()) * share_mm2
+    return Measurand(name="volume", value=value, sigma=float(np.hypot(sigma, 0.05 * value)), unit="mm3")
+
+
+def _length_mm(points_mm: Floats) -> float:
+    """Largest extent of the points along their principal axis."""
+    centred = points_mm - points_mm.mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    return float(np.ptp(centred @ axes[:, -1]))

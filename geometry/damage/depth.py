@@ -1,0 +1,212 @@
+"""How deep a damage is: along the span at the tip, along the chord at an edge, else normal to the twin."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from geometry.blade.nominal import Nominal
+from geometry.blade.solid import slice_loops
+from geometry.blade.span import on_line_mm
+from geometry.damage.regions import Field, Region
+from geometry.deformation.twin import Twin
+from geometry.types import Floats, Measurand, Measured, NotMeasured, Zone
+
+DEEP = 3.0  # sigmas below the twin at which a single point lies on the break for certain
+PLANE_POINTS = 12  # of the break, whose plane ends it
+PLANE_REACH = 3.0  # spacings that such a plane may be continued beyond them
+BORDER = 0.3  # standard uncertainty of where a break ends, in spacings of its points, at least
+FRONT_POINTS = 30  # of the break about a height, whose quadric is the metal left there
+LEAST_FRONT = 10
+FRONT = 0.1  # standard uncertainty of that quadric between the points, in their spacings, at least
+HEIGHTS = 40  # over an edge damage, at most
+RIM_STEP_MM = 0.02  # between points of the twin's section at an edge
+NEAR_EDGE_MM = 6.0  # of the edge line, where the edge of the twin is sought
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeLoss:
+    """What an edge damage took of a section, along the chord, where it took most."""
+
+    depth_mm: Measured
+    remaining_chord_mm: Measured
+
+
+def normal_depth(region: Region, found: Field) -> Measurand:
+    """The largest distance normal to the twin.
+
+    The mean over a neighbourhood tells where the bottom is, and flattens it; how deep it is tells the quadric
+    through the points around.
+    """
+    deepest = region.points[int(np.argmax(np.abs(found.smooth_mm[region.points])))]
+    around = found.neighbours[deepest]
+    off_mm = found.scan_mm[around] - found.scan_mm[deepest]
+    across, along = np.linalg.eigh(off_mm.T @ off_mm)[1][:, :0:-1].T
+    depth_mm = np.abs(found.height_mm[around])
+    fitted_mm, sagitta_mm = _bottom(off_mm @ across, off_mm @ along, depth_mm, found.spacing_mm)
+    scatter_mm = float(np.std(depth_mm - fitted_mm))
+    sigma_mm = float(np.linalg.norm([found.sigma_mm[deepest], 0.5 * scatter_mm, sagitta_mm]))
+    return Measurand(name="depth", value=float(fitted_mm.max()), sigma=sigma_mm, unit="mm")
+
+
+def _bottom(u_mm: Floats, v_mm: Floats, depth_mm: Floats, spacing_mm: float) -> tuple[Floats, float]:
+    """Depths (n,) on the full quadric through points, and how far it bends from one point to the next."""
+    terms = np.stack([np.ones_like(u_mm), u_mm, v_mm, u_mm**2, u_mm * v_mm, v_mm**2], axis=1)
+    coefficients = np.linalg.lstsq(terms, depth_mm, rcond=1e-6)[0]
+    bend_per_mm = np.linalg.norm(
+        [2.0 * coefficients[3], 2.0 * coefficients[5], np.sqrt(2.0) * coefficients[4]]
+    )
+    return np.asarray(terms @ coefficients), float(bend_per_mm) * spacing_mm**2 / np.sqrt(8.0)
+
+
+def span_depth(tip_mm: float, lowest: Measured) -> Measured:
+    """The loss along the span: from the twin's tip down to the lowest point of the break."""
+    if isinstance(lowest, NotMeasured):
+        return lowest
+    return Measurand(
+        name="depth", value=max(tip_mm - lowest.value, 0.0), sigma=lowest.sigma, unit=lowest.unit
+    )
+
+
+def lowest_mm(region: Region, found: Field, twin: Twin) -> Measured:
+    """Height of the lowest point of a damage: where the plane of the lowest of its break leaves the twin.
+
+    The lowest of the scan points alone would lie too high, by about their spacing; those that merely stand
+    off the twin next to it too low. A break that is lowest inside the blade ends at its lowest point.
+    """
+    break_mm = _break(region, found)
+    if len(break_mm) < PLANE_POINTS:
+        return NotMeasured(reason=f"{len(break_mm)} points lie on the damage for certain")
+    tree = cKDTree(break_mm)
+    start = break_mm[int(np.argmin(break_mm[:, 2]))]
+    apart_mm, near = tree.query(start, PLANE_POINTS)
+    near_mm, weight = break_mm[near], (1.0 - (apart_mm / (1.1 * apart_mm[-1])) ** 2) ** 2
+    middle_mm = np.average(near_mm, axis=0, weights=weight)
+    normal = np.linalg.eigh(np.cov(near_mm.T, aweights=weight))[1][:, 0]
+    reach_mm = PLANE_REACH * found.spacing_mm
+    rim_mm = _plane_section(twin, middle_mm, normal, start, 2.0 * reach_mm)
+    rim_mm = np.concatenate([start[None], rim_mm[tree.query(rim_mm)[0] <= reach_mm]])
+    end_mm = rim_mm[int(np.argmin(rim_mm[:, 2]))]
+    bare_mm = _bare_mm(end_mm, found, 4.0 * reach_mm)
+    border_mm = max(BORDER * found.spacing_mm, 0.5 * float(start[2] - end_mm[2]), 0.5 * bare_mm)
+    scatter_mm = float(np.sqrt(np.average(((near_mm - middle_mm) @ normal) ** 2, weights=weight)))
+    sigma_mm = float(np.linalg.norm([border_mm, scatter_mm, _sigma_mm(region, found)]))
+    return Measurand(name="lowest", value=float(end_mm[2]) - 0.5 * bare_mm, sigma=sigma_mm, unit="mm")
+
+
+def _bare_mm(end_mm: Floats, found: Field, reach_mm: float) -> float:
+    """How much farther than their spacing the end of a break lies from the points of the sound skin.
+
+    The break ends somewhere in such a gap.
+    """
+    near = (np.abs(found.scan_mm - end_mm).max(axis=1) <= reach_mm) & (
+        np.abs(found.height_mm) <= DEEP * np.hypot(found.noise_mm, found.sigma_mm)
+    )
+    apart_mm = np.linalg.norm(found.scan_mm[near] - end_mm, axis=1)
+    return float(np.clip(apart_mm.min(initial=reach_mm) - found.spacing_mm, 0.0, None))
+
+
+def _break(region: Region, found: Field) -> Floats:
+    """The points (m, 3) of a region that lie off the twin each by itself and not alone."""
+    sigma_mm = np.hypot(found.noise_mm, found.sigma_mm[region.points])
+    points_mm = found.scan_mm[region.points[np.abs(found.height_mm[region.points]) > DEEP * sigma_mm]]
+    if len(points_mm) < PLANE_POINTS:
+        return points_mm
+    apart_mm = cKDTree(points_mm).query(points_mm, 3)[0][:, 2]
+    return np.asarray(points_mm[apart_mm <= 3.0 * found.spacing_mm])
+
+
+def _sigma_mm(region: Region, found: Field) -> float:
+    return float(np.median(found.sigma_mm[region.points]))
+
+
+def _plane_section(twin: Twin, at_mm: Floats, normal: Floats, about_mm: Floats, reach_mm: float) -> Floats:
+    """Points (m, 3) where edges of the twin near a place cross a plane through `at_mm`."""
+    vertices, faces = twin.mesh.vertices_mm, twin.mesh.faces
+    near = np.abs(vertices - about_mm).max(axis=1) <= reach_mm
+    faces = faces[near[faces].any(axis=1)]
+    a, b = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
+    above_a, above_b = (vertices[a] - at_mm) @ normal, (vertices[b] - at_mm) @ normal
+    cut = above_a * above_b < 0.0
+    share = above_a[cut] / (above_a[cut] - above_b[cut])
+    return np.asarray(vertices[a[cut]] + share[:, None] * (vertices[b[cut]] - vertices[a[cut]]))
+
+
+def edge_loss(region: Region, found: Field, nominal: Nominal, twin: Twin, zone: Zone) -> EdgeLoss:
+    """The largest loss in a section plane, along the chord: from the twin's edge to the metal left.
+
+    At each height the break is a quadric through its points round about; what is left of the section begins
+    at its foremost point, where the break leaves the skin or between.
+    """
+    break_mm = _break(region, found)
+    if len(break_mm) < LEAST_FRONT:
+        few = NotMeasured(reason=f"{len(break_mm)} points lie on the damage for certain")
+        return EdgeLoss(depth_mm=few, remaining_chord_mm=few)
+    low_mm, high_mm = break_mm[:, 2].min(), break_mm[:, 2].max()
+    count = int(np.clip((high_mm - low_mm) / found.spacing_mm, 3, HEIGHTS))
+    flat = np.zeros((len(twin.mesh.faces), 3, 3))
+    heights_mm = np.linspace(low_mm, high_mm, count + 2)[1:-1]
+    rows = [_section_loss(float(z_mm), break_mm, nominal, twin, zone, flat) for z_mm in heights_mm]
+    loss_mm, scatter_mm, chord_mm = np.array(rows).T
+    worst, shortest = int(np.argmax(loss_mm)), int(np.argmin(chord_mm - loss_mm))
+    common_mm = np.hypot(_sigma_mm(region, found), FRONT * found.spacing_mm)
+    sigma_mm = [np.hypot(common_mm, scatter_mm[i]) for i in (worst, shortest)]
+    return EdgeLoss(
+        depth_mm=Measurand(name="depth", value=float(loss_mm[worst]), sigma=float(sigma_mm[0]), unit="mm"),
+        remaining_chord_mm=Measurand(
+            name="remaining_chord",
+            value=float(chord_mm[shortest] - loss_mm[shortest]),
+            sigma=float(sigma_mm[1]),
+            unit="mm",
+        ),
+    )
+
+
+def _section_loss(
+    z_mm: float, break_mm: Floats, nominal: Nominal, twin: Twin, zone: Zone, flat: Floats
+) -> tuple[float, float, float]:
+    """Loss at a height, scatter of the break about its quadric there, and the chord of the twin."""
+    outward, edge_mm = _outward(nominal, zone, z_mm)
+    across = np.array([-outward[1], outward[0]])
+    loops = slice_loops(twin.mesh, flat, z_mm)
+    loop_mm = max((loop.points_mm for loop in loops), key=len)
+    chord_mm = float(np.ptp(loop_mm @ outward))
+    rim_mm = _dense(loop_mm)
+    rim_mm = rim_mm[np.linalg.norm(rim_mm - edge_mm, axis=1) < NEAR_EDGE_MM]
+    foremost_mm = float((rim_mm @ outward).max())
+    near_mm = break_mm[np.argsort(np.abs(break_mm[:, 2] - z_mm))[:FRONT_POINTS]]
+    coefficients, scatter_mm = _quadric(
+        (near_mm[:, :2] - edge_mm) @ across, near_mm[:, 2] - z_mm, foremost_mm - near_mm[:, :2] @ outward
+    )
+    skin_mm, side_mm = foremost_mm - rim_mm @ outward, (rim_mm - edge_mm) @ across
+    cut_mm = coefficients[0] + coefficients[1] * side_mm + coefficients[2] * side_mm**2
+    left = skin_mm >= cut_mm
+    if left.all():
+        return 0.0, scatter_mm, chord_mm
+    return float(min(skin_mm[left].min(initial=np.inf), cut_mm[~left].min())), scatter_mm, chord_mm
+
+
+def _quadric(across_mm: Floats, up_mm: Floats, depth_mm: Floats) -> tuple[Floats, float]:
+    """Coefficients of 1, across, across^2 in the full quadric of the depth, and the scatter about it."""
+    terms = np.stack(
+        [np.ones_like(up_mm), across_mm, across_mm**2, across_mm * up_mm, up_mm, up_mm**2], axis=1
+    )
+    coefficients = np.asarray(np.linalg.lstsq(terms, depth_mm, rcond=1e-6)[0])
+    return coefficients, float(np.std(depth_mm - terms @ coefficients))
+
+
+def _dense(loop_mm: Floats) -> Floats:
+    """The closed polyline (m, 2) with points `RIM_STEP_MM` apart."""
+    closed_mm = np.concatenate([loop_mm, loop_mm[:1]])
+    arc_mm = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed_mm, axis=0), axis=1))])
+    at_mm = np.arange(0.0, arc_mm[-1], RIM_STEP_MM)
+    return np.column_stack([np.interp(at_mm, arc_mm, closed_mm[:, i]) for i in range(2)])
+
+
+def _outward(nominal: Nominal, zone: Zone, z_mm: float) -> tuple[Floats, Floats]:
+    """The direction (2,) along the chord out of an edge at a height, and the edge (2,) there."""
+    le_mm, te_mm = (
+        on_line_mm(line, np.array([z_mm]))[0] for line in (nominal.le_line_mm, nominal.te_line_mm)
+    )
+    chord_mm = le_mm - te_mm if zone is Zone.LEADING_EDGE else te_mm - le_mm
+    return chord_mm / np.linalg.norm(chord_mm), le_mm if zone is Zone.LEADING_EDGE else te_mm

@@ -1,0 +1,219 @@
+"""Where the scan leaves the twin: connected regions of scan points, and the skin that each has lost."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from geometry.blade.nominal import Nominal
+from geometry.damage.broken import skin_of
+from geometry.deformation.twin import Twin
+from geometry.errors import BadInput
+from geometry.kernels.graph import dilate, grow, neighbourhood_mean
+from geometry.registration.register import Alignment
+from geometry.scan.surface import k_nearest
+from geometry.transforms import apply
+from geometry.types import Bools, Cloud, Floats, Ints
+
+SKIN_SPACINGS = 3.0  # skin farther than this many point spacings from every sound point has lost its cover
+NONE = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionSettings:
+    """When points that stand off the twin make a region.
+
+    Distances are means over a neighbourhood, in units of their standard deviation: noise of the mean and
+    sigma of the twin. A region begins at `high`, and reaches down to `low`.
+    """
+
+    neighbours: int = 16
+    high: float = 6.0
+    low: float = 3.0
+    floor_mm: float = 0.008  # least standard deviation: what the scanner's own errors do not average out
+    least_points: int = 12
+    join_mm: float = 1.0  # lost metal this near to other lost metal is one damage
+
+    def __post_init__(self) -> None:
+        if not (self.neighbours >= 4 and 0.0 < self.low <= self.high and self.least_points >= 4):
+            raise BadInput(f"regions: {self} contradicts itself")
+        if not (self.floor_mm > 0.0 and self.join_mm > 0.0):
+            raise BadInput(f"regions: {self} contradicts itself")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Field:
+    """The scan against the twin, nominal frame. Distances are signed, positive outside."""
+
+    scan_mm: Floats  # (n, 3)
+    neighbours: Ints  # (n, k)
+    spacing_mm: float  # between neighbouring points
+    noise_mm: float  # of a single point
+    height_mm: Floats  # (n,) distance of each point
+    smooth_mm: Floats  # (n,) mean distance over the neighbourhood
+    sigma_mm: Floats  # (n,) of that mean
+    on_airfoil: Bools  # (n,) nearest to required surface
+    skin_mm: Floats  # (s, 3) the samples of the required surface on the twin
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Region:
+    """Points on one side of the twin, connected, and the samples of the skin above that nothing covers."""
+
+    points: Ints  # indices into the scan
+    lost: Ints  # indices into the nominal's samples
+    missing: bool  # else excess
+
+
+def stand_off(
+    cloud: Cloud, alignment: Alignment, nominal: Nominal, twin: Twin, settings: RegionSettings
+) -> Field:
+    """How far each scan point lies off the twin, and how certain that is."""
+    scan_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
+    neighbours, distances_mm = k_nearest(scan_mm, min(settings.neighbours + 1, len(scan_mm)))
+    distance_mm, face = _twin_distances(scan_mm, twin)
+    twin_sigma_mm = twin.sigma_mm[twin.mesh.faces[face]].mean(axis=1)
+    noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
+    mean_sigma_mm = noise_mm / np.sqrt(neighbours.shape[1])
+    return Field(
+        scan_mm=scan_mm,
+        neighbours=neighbours,
+        spacing_mm=float(np.median(distances_mm[:, -1]) * np.sqrt(np.pi / neighbours.shape[1])),
+        noise_mm=noise_mm,
+        height_mm=distance_mm,
+        smooth_mm=neighbourhood_mean(distance_mm, neighbours[:, 1:]),
+        sigma_mm=np.sqrt(np.maximum(mean_sigma_mm, settings.floor_mm) ** 2 + twin_sigma_mm**2),
+        on_airfoil=nominal.airfoil_face[twin.nominal_face[face]],
+        skin_mm=_on_twin(nominal, twin),
+    )
+
+
+def _twin_distances(scan_mm: Floats, twin: Twin) -> tuple[Floats, Ints]:
+    distance_mm, _, face = skin_of(twin.mesh).closest(scan_mm)
+    return distance_mm, face
+
+
+def find_regions(field: Field, nominal: Nominal, settings: RegionSettings) -> list[Region]:
+    """The regions of missing and of excess metal on the airfoil, each with the skin that it has lost."""
+    groups = [
+        (points, missing)
+        for missing, sign in ((True, -1.0), (False, 1.0))
+        for points in _connected(sign * field.smooth_mm, sign * field.height_mm, field, settings)
+    ]
+    lost = _lost_skin(field, groups, nominal)
+    absent, excess = [i for i, g in enumerate(groups) if g[1]], [i for i, g in enumerate(groups) if not g[1]]
+    merged = _merged([(groups[i][0], lost[i]) for i in absent], field, nominal, settings.join_mm)
+    regions = [Region(points=points, lost=skin, missing=True) for points, skin in merged]
+    regions += [Region(points=groups[i][0], lost=NONE, missing=False) for i in excess]
+    return sorted(regions, key=lambda region: -len(region.points))
+
+
+def _connected(mean_mm: Floats, own_mm: Floats, field: Field, settings: RegionSettings) -> list[Ints]:
+    """Index sets of the points whose mean stands off by `high` sigmas, with what hangs together above `low`.
+
+    Next to a deep break the means reach past its border: sound points among them are given back, and points
+    that the means of their sound neighbours hide are taken in.
+    """
+    certain = field.on_airfoil & (mean_mm > settings.high * field.sigma_mm)
+    likely = field.on_airfoil & (mean_mm > settings.low * field.sigma_mm)
+    reached = grow(certain, likely, field.neighbours)
+    proven = field.on_airfoil & (own_mm > settings.low * np.maximum(field.noise_mm, field.sigma_mm))
+    wider = dilate(reached, field.neighbours) & proven
+    chosen = np.flatnonzero(wider | (reached & (own_mm > 0.5 * mean_mm)))
+    labels = _labels(chosen, field.neighbours)
+    groups = [chosen[labels == label] for label in np.unique(labels)]
+    return [group for group in groups if len(group) >= settings.least_points]
+
+
+def _labels(chosen: Ints, neighbours: Ints) -> Ints:
+    """Component (k,) of each chosen point over the neighbour graph."""
+    place = np.full(len(neighbours), -1, np.int64)
+    place[chosen] = np.arange(len(chosen))
+    near = place[neighbours[chosen]]
+    row = np.repeat(np.arange(len(chosen)), near.shape[1])
+    linked = near.ravel() >= 0
+    graph = coo_array(
+        (np.ones(int(linked.sum()), np.int8), (row[linked], near.ravel()[linked])), shape=(len(chosen),) * 2
+    )
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal) -> list[Ints]:
+    """For each group, the samples of the required surface that no sound point covers, and whose nearest
+    scan point is in it or whose patch of uncovered skin borders on it."""
+    owner = np.full(len(field.scan_mm), -1, np.int64)
+    for index, (points, _) in enumerate(groups):
+        owner[points] = index
+    sound = np.flatnonzero(owner < 0)
+    reach_mm = max(SKIN_SPACINGS * field.spacing_mm, nominal.settings.sample_mm)
+    sound_mm = np.asarray(
+        cKDTree(field.scan_mm[sound]).query(field.skin_mm, distance_upper_bound=reach_mm)[0]
+    )
+    bare = np.flatnonzero(~np.isfinite(sound_mm))
+    if not (len(bare) and groups):
+        return [NONE for _ in groups]
+    patch = _patches(field.skin_mm[bare], 2.5 * nominal.settings.sample_mm)
+    damaged = np.flatnonzero(owner >= 0)
+    distance_mm, nearest = cKDTree(field.scan_mm[damaged]).query(field.skin_mm[bare])
+    nearest_owner = owner[damaged[nearest]]
+    lost: list[list[Ints]] = [[] for _ in groups]
+    for label in np.unique(patch):
+        members = patch == label
+        if distance_mm[members].min() <= 2.0 * reach_mm:
+            for group in np.unique(nearest_owner[members]):
+                lost[group].append(bare[members & (nearest_owner == group)])
+    loose = np.flatnonzero((sound_mm > field.spacing_mm) & np.isfinite(sound_mm))
+    return [
+        _to_the_border(np.concatenate(parts), loose, field.skin_mm, nominal) if parts else NONE
+        for parts in lost
+    ]
+
+
+def _to_the_border(lost: Ints, loose: Ints, skin_mm: Floats, nominal: Nominal) -> Ints:
+    """The lost samples and those beside them that lie farther than a point spacing from sound points."""
+    apart_mm = np.asarray(cKDTree(skin_mm[lost]).query(skin_mm[loose])[0])
+    return np.concatenate([lost, loose[apart_mm <= 1.5 * nominal.settings.sample_mm]])
+
+
+def _on_twin(nominal: Nominal, twin: Twin) -> Floats:
+    """The samples of the required surface (s, 3) moved onto the twin."""
+    undeformed = cKDTree(twin.mesh.vertices_mm - twin.displacement_mm)
+    near = np.asarray(undeformed.query(nominal.samples.points_mm)[1])
+    return nominal.samples.points_mm + twin.displacement_mm[near]
+
+
+def _patches(points_mm: Floats, link_mm: float) -> Ints:
+    """Component (k,) of points that are joined when nearer than `link_mm`."""
+    pairs = cKDTree(points_mm).query_pairs(link_mm, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), shape=(len(points_mm),) * 2)
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def _merged(
+    groups: list[tuple[Ints, Ints]], field: Field, nominal: Nominal, join_mm: float
+) -> list[tuple[Ints, Ints]]:
+    """The groups of missing metal, those joined whose broken surfaces or lost skins come near each other."""
+    if not groups:
+        return []
+    solids = [
+        cKDTree(np.concatenate([field.scan_mm[points], nominal.samples.points_mm[skin]]))
+        for points, skin in groups
+    ]
+    pairs = [
+        (i, j)
+        for i in range(len(groups))
+        for j in range(i)
+        if solids[i].count_neighbors(solids[j], join_mm) > 0
+    ]
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(pairs), np.int8), (rows, columns)), shape=(len(groups),) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    return [
+        (
+            np.sort(np.concatenate([groups[i][0] for i in np.flatnonzero(labels == label)])),
+            np.unique(np.concatenate([groups[i][1] for i in np.flatnonzero(labels == label)])),
+        )
+        for label in np.unique(labels)
+    ]

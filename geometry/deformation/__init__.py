@@ -1,0 +1,1 @@
+"""The damage-free twin: the nominal deformed onto what is sound."""

@@ -1,0 +1,64 @@
+"""What the twin's fit needs of the nominal: a mesh that can bend, and nodes scattered over it."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from geometry.blade.nominal import Nominal
+from geometry.blade.solid import face_areas_mm2, solid_normals
+from geometry.deformation.freeform import Lattice, lattice_over
+from geometry.deformation.offset import Nodes, scatter_nodes
+from geometry.deformation.refine import Refined, refine
+from geometry.types import Ints
+
+COARSER = 2.5  # spacing of the nodes that the wear is fitted to, in those of the offset
+EDGE_CELLS = 0.27  # longest edge of the mesh, in cells of the lattice
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ground:
+    """A nominal prepared for fits with about so many nodes."""
+
+    nominal: Nominal
+    lattice: Lattice
+    refined: Refined
+    nodes: Nodes
+    graph: Ints  # (nodes, k) neighbours
+    coarse: Nodes  # what the wear is fitted to
+
+
+@lru_cache(maxsize=2)
+def prepare_ground(nominal: Nominal, nodes: int, cells: int) -> Ground:
+    """The ground with about so many nodes and cells of the lattice, kept from one part to the next."""
+    lattice = lattice_over(nominal.samples.points_mm, cells)
+    corners = solid_normals(nominal.mesh).corner
+    refined = refine(nominal.mesh, corners, nominal.airfoil_face, EDGE_CELLS * lattice.cell_mm)
+    fine = _scatter(nominal, refined, nodes)
+    return Ground(
+        nominal=nominal,
+        lattice=lattice,
+        refined=refined,
+        nodes=fine,
+        graph=fine.graph(),
+        coarse=scatter_nodes(fine.points_mm, fine.normals, 1.0, COARSER * fine.spacing_mm),
+    )
+
+
+def _scatter(nominal: Nominal, refined: Refined, wanted: int) -> Nodes:
+    """About `wanted` nodes over the airfoil, more where it turns."""
+    mesh = refined.mesh
+    area_mm2 = np.where(nominal.airfoil_face[refined.parent], face_areas_mm2(mesh), 0.0)
+    spacing_mm = float(np.sqrt(area_mm2.sum() / wanted))
+    count = int(12.0 * area_mm2.sum() / spacing_mm**2)
+    each_mm2 = float(area_mm2.sum()) / count
+    face = np.searchsorted(np.cumsum(area_mm2), (np.arange(count) + 0.5) * each_mm2)
+    # The R2 sequence (Roberts, 2018) spreads the points in their faces without clumps.
+    u, v = np.modf(np.arange(count)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]))[0].T
+    u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
+    weights = np.stack([1.0 - u - v, u, v], axis=1)
+    points_mm = np.einsum("nc,ncj->nj", weights, mesh.vertices_mm[mesh.faces[face]])
+    normals = np.einsum("nc,ncj->nj", weights, refined.corner_normals[face])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    within = (points_mm[:, 2] >= nominal.z_min_mm) & (points_mm[:, 2] <= nominal.z_max_mm)
+    return scatter_nodes(points_mm[within], normals[within], each_mm2, spacing_mm)

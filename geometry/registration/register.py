@@ -1,0 +1,306 @@
+"""Cloud onto nominal: coarse, robust, then plain least squares on what is not damaged."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from geometry.blade.nominal import Closest, Nominal
+from geometry.errors import BadInput, CannotRegister
+from geometry.registration.coarse import Coarse, CoarseSettings, find_pose
+from geometry.registration.ends import End, on_rim, scan_ends, without_strays
+from geometry.registration.fit import (
+    Fit,
+    Held,
+    every,
+    felt,
+    fit_kept,
+    fit_robust,
+    information,
+    motions,
+    unit_twist,
+)
+from geometry.registration.mask import MaskSettings, damaged, form_of, robust_sigma
+from geometry.registration.slide import LEAST, slides_mm
+from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
+from geometry.scan.neighbourhood import nearest_of
+from geometry.transforms import apply, exp, inverse
+from geometry.types import Bools, Cloud, Floats, Ints
+
+ENDS_MM = 0.01  # standard uncertainty of the surface along a motion beyond which ends of the scan are asked
+LEAST_WEIGHT = 1e-3  # of an end beside all points: enough that no step leaves it out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Alignment:
+    """The pose of the scan on the nominal, how it was found and how certain it is.
+
+    A pose error is a twist (rx, ry, rz in rad, tx, ty, tz in mm) that turns about `pivot_mm` and
+    then shifts, applied on the nominal side: `exp(twist, pivot_mm) @ T_nominal_scan`.
+    `information` (6, 6) is the inverse covariance of that twist from point noise alone;
+    `form_covariance` (6, 6) is what the form of the part adds to that covariance: deviations that many
+    neighbouring points share. Both together are the uncertainty of the pose.
+    """
+
+    method: str
+    T_nominal_scan: Floats  # (4, 4)
+    pivot_mm: Floats  # (3,), nominal frame
+    information: Floats  # (6, 6)
+    weak_directions: tuple[tuple[float, ...], ...]  # unit twists the surface leaves free, or nearly so
+    rms_mm: float  # of the kept points, along the normal
+    noise_mm: float  # robust standard deviation of the kept residuals
+    inlier_fraction: float  # kept as undamaged
+    explained_fraction: float  # scan points that the nominal explains (within a few tenths of a mm)
+    runner_up_ratio: float  # score of the second-best coarse pose over the best; 1 = ambiguous
+    iterations: int
+    converged: bool
+    form_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisterSettings:
+    coarse: CoarseSettings = field(default_factory=CoarseSettings)
+    mask: MaskSettings = field(default_factory=MaskSettings)
+    least_points: int = 200
+    robust_points: int = 8000  # of the cloud, for the robust fit
+    fit_points: int = 250_000  # of the cloud, for mask and least squares: 0.0005 mm of noise at most
+    rounds: int = 2  # of mask and least squares
+    explained_mm: float = 0.3
+    loose_mm: float = 0.3  # standard uncertainty of the surface along a motion that makes it a free one
+    slide_mm: float = 0.05  # the same, beyond which other places along that motion are tried
+
+    def __post_init__(self) -> None:
+        if not (self.least_points >= 50 and self.robust_points >= 500 and self.rounds >= 1):
+            raise BadInput(f"register: {self} asks for too few points or rounds")
+        if not min(self.explained_mm, self.loose_mm, self.slide_mm) > 0.0:
+            raise BadInput(f"register: {self} has a distance that is none")
+
+
+def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = RegisterSettings()) -> Alignment:
+    """The pose of the scan on the nominal.
+
+    Coarse by principal axes and many starts, then point-to-plane with Tukey's weights on the exact mesh,
+    then rounds of damage mask and plain least squares on the rest. Neither step moves along a direction that
+    the surface does not feel (a constant section with linear twist is a screw). Where noise and form leave
+    one open, other places along it are tried for the ends that they would explain; what stays open is
+    reported. Raises `CannotRegister` for a cloud too small or without shape.
+    """
+    if len(cloud) < settings.least_points:
+        raise CannotRegister(f"{len(cloud)} scan points are fewer than {settings.least_points}")
+    coarse = find_pose(cloud.points_mm, nominal, settings.coarse)
+    cloud = _thinned(cloud, settings.fit_points)
+    few_mm = cloud.points_mm[every(len(cloud), settings.robust_points)]
+    robust = fit_robust(few_mm, coarse.T_nominal_scan, nominal)
+    neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
+    settled = _settled(cloud, robust, neighbours, nominal, settings)
+    places = [settled, *_elsewhere(cloud, settled, neighbours, nominal, settings)]
+    return _alignment(cloud, nominal, places, coarse, robust.iterations, settings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Settled:
+    """A least-squares pose, the points it rests on, and how certain it is."""
+
+    fit: Fit
+    kept: Bools
+    normal_matrix: Floats  # (6, 6) of the kept points, unweighted
+    information: Floats
+    form_covariance: Floats
+    certainty: Certainty
+
+
+def _thinned(cloud: Cloud, most: int) -> Cloud:
+    if len(cloud) <= most:
+        return cloud
+    kept = every(len(cloud), most)
+    return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
+
+
+def _settled(
+    cloud: Cloud, start: Fit, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
+) -> Settled:
+    """Rounds of mask and least squares on the whole cloud."""
+    found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
+    fit = replace(start, found=found)
+    for _ in range(settings.rounds):
+        sound = ~_damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, nominal, settings)
+        if (sound & felt(nominal, fit.found)).sum() < settings.least_points:
+            raise CannotRegister(f"{int(sound.sum())} scan points lie on the nominal")
+        fit = fit_kept(cloud.points_mm, fit, without_strays(sound, fit.found, nominal), nominal)
+        turns += fit.iterations
+    return held_by_ends(cloud, replace(fit, iterations=turns), sound, nominal)
+
+
+def _past_rims_none(found: Closest, nominal: Nominal) -> Closest:
+    """The same feet, those on a rim without a distance: a scan may slide past its end and is no damage."""
+    return replace(found, distance_mm=np.where(on_rim(nominal, found.points_mm), 0.0, found.distance_mm))
+
+
+def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
+    """What a least-squares pose on the sound points (n,) is worth; where these leave a motion open and the
+    scan stops sharply at both ends of the nominal, the pose that lays these ends on it, too.
+    """
+    resting = without_strays(sound, fit.found, nominal)
+    settled = _worth(cloud, fit, resting, nominal)
+    if not settled.certainty.sigma_mm[-1] > ENDS_MM:
+        return settled
+    moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
+    ends = scan_ends(moved_mm, sound, fit.found, nominal)
+    if not ends:
+        return settled
+    held = _held(ends, settled, nominal)
+    again = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
+    return _with_ends(
+        settled, replace(again, iterations=fit.iterations + again.iterations), held, ends, nominal
+    )
+
+
+def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
+    kept = sound & felt(nominal, fit.found)
+    moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
+    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept])
+    form = form_covariance(nominal, moved_mm, found)
+    design = motions(moved_mm, found.normals, nominal.pivot_mm)
+    return Settled(
+        fit=fit,
+        kept=kept,
+        normal_matrix=design.T @ design,
+        information=known,
+        form_covariance=form,
+        certainty=certainty(nominal, known, form),
+    )
+
+
+def _held(ends: tuple[End, ...], settled: Settled, nominal: Nominal) -> Held:
+    """The ends, each weighted as the points are: by the variance that these show along the open motion."""
+    open_ = settled.certainty.twists[:, -1]
+    a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
+    least = LEAST_WEIGHT * len(settled.kept)
+    back = inverse(settled.fit.T_nominal_scan)
+    return Held(
+        points_mm=apply(back, np.array([end.point_mm for end in ends])),
+        heights_mm=np.array([end.height_mm for end in ends]),
+        weights=np.array([max(a_point_mm2 / end.sigma_mm**2, least) for end in ends]),
+    )
+
+
+def _with_ends(settled: Settled, fit: Fit, held: Held, ends: tuple[End, ...], nominal: Nominal) -> Settled:
+    """The same points with ends beside them: covariances as that weighted least squares passes them on."""
+    rows = held.rows(fit.T_nominal_scan, nominal.pivot_mm)
+    weighted = rows.design.T * rows.weights
+    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    unit = np.outer(scale, scale)
+    both = np.linalg.inv((settled.normal_matrix + weighted @ rows.design) * unit) * unit
+    share = both @ settled.normal_matrix
+    noise = share @ free_inverse(settled.information, scale) @ share.T
+    noise += both @ (weighted * [end.sigma_mm**2 for end in ends]) @ weighted.T @ both
+    known = np.linalg.inv(noise / unit) / unit
+    form = share @ settled.form_covariance @ share.T
+    return replace(
+        settled,
+        fit=fit,
+        information=known,
+        form_covariance=form,
+        certainty=certainty(nominal, known, form),
+    )
+
+
+def _elsewhere(
+    cloud: Cloud, settled: Settled, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
+) -> list[Settled]:
+    """Other poses along the least certain motion that explain more of the scan and are surer of it."""
+    sigma_mm, twist = float(settled.certainty.sigma_mm[-1]), settled.certainty.twists[:, -1]
+    if sigma_mm <= settings.slide_mm:
+        return []
+    T, found = settled.fit.T_nominal_scan, settled.fit.found
+    near_mm = max(4.0 * robust_sigma(found.distance_mm[settled.kept]), 0.05)
+    moved_mm = apply(T, cloud.points_mm)
+    off = (np.abs(found.distance_mm) > near_mm) & ~settled.kept
+    places = []
+    for move_mm in slides_mm(moved_mm[settled.kept], moved_mm[off], twist, 4.0 * sigma_mm, near_mm, nominal):
+        moved = replace(settled.fit, T_nominal_scan=exp(move_mm * twist, nominal.pivot_mm) @ T)
+        place = _settled(cloud, moved, neighbours, nominal, settings)
+        surer = place.certainty.sigma_mm[-1] < 0.5 * sigma_mm
+        if surer and place.kept.sum() >= settled.kept.sum() + LEAST:
+            places.append(place)
+    return sorted(places, key=lambda place: -int(place.kept.sum()))
+
+
+def _damage_of(
+    cloud: Cloud, found: Closest, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
+) -> Bools:
+    floor_mm = float(np.median(cloud.sigma_mm)) / np.sqrt(neighbours.shape[1])
+    form_mm = form_of(found.points_mm, found.normals, found.distance_mm, settings.mask)
+    return damaged(found.distance_mm - form_mm, neighbours, floor_mm, settings.mask)
+
+
+def _alignment(
+    cloud: Cloud,
+    nominal: Nominal,
+    places: list[Settled],
+    coarse: Coarse,
+    iterations: int,
+    settings: RegisterSettings,
+) -> Alignment:
+    settled = places[min(1, len(places) - 1)]
+    fit, kept = settled.fit, settled.kept
+    moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
+    residual_mm = fit.found.distance_mm[kept]
+    on_part = moved_mm[:, 2] >= nominal.z_min_mm
+    explained = np.abs(fit.found.distance_mm[on_part]) <= settings.explained_mm
+    return Alignment(
+        method="airfoil",
+        T_nominal_scan=fit.T_nominal_scan,
+        pivot_mm=nominal.pivot_mm,
+        information=settled.information,
+        form_covariance=settled.form_covariance,
+        weak_directions=_weak(places, settings),
+        rms_mm=float(np.sqrt(np.mean(residual_mm**2))),
+        noise_mm=robust_sigma(residual_mm),
+        inlier_fraction=float(kept.mean()),
+        explained_fraction=float(explained.mean()) if len(explained) else 0.0,
+        runner_up_ratio=coarse.runner_up_ratio,
+        iterations=iterations + fit.iterations,
+        converged=fit.converged,
+    )
+
+
+def _weak(places: list[Settled], settings: RegisterSettings) -> tuple[tuple[float, ...], ...]:
+    """Unit twists that the chosen place leaves open, or that two places contest."""
+    chosen = places[min(1, len(places) - 1)]
+    open_ = [unit_twist(t) for t in chosen.certainty.twists.T[chosen.certainty.sigma_mm > settings.loose_mm]]
+    if len(places) > 2 and not _won(places):
+        open_ = open_ or [unit_twist(places[0].certainty.twists[:, -1])]
+    return tuple(open_) if len(open_) > len(chosen.fit.weak) else chosen.fit.weak
+
+
+def _won(places: list[Settled]) -> bool:
+    """Whether the best other place explains twice as many more points as the next that is another one."""
+    first, best, *rest = places
+    gain = int(best.kept.sum() - first.kept.sum())
+    rivals = [r for r in rest if not np.allclose(r.fit.T_nominal_scan, best.fit.T_nominal_scan, atol=0.05)]
+    return all(gain >= 2 * int(r.kept.sum() - first.kept.sum()) for r in rivals)
+
+
+def mask_damage(
+    cloud: Cloud,
+    alignment: Alignment,
+    nominal: Nominal,
+    settings: RegisterSettings = RegisterSettings(),
+) -> Bools:
+    """The points (n,) of an aligned cloud that lie on damage, with the points next to it."""
+    found = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
+    neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
+    return _damage_of(cloud, found, neighbours, nominal, settings)
+
+
+def pose_covariance(alignment: Alignment) -> Floats:
+    """Covariance (6, 6) of the pose twist from noise; where the surface leaves it free, 1 mm or 0.02 rad."""
+    prior = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0]) ** -2.0
+    return np.linalg.inv(alignment.information + np.diag(prior)).astype(np.float64)
+
+
+def variance_along(alignment: Alignment, point_mm: Floats, normal: Floats) -> float:
+    """Variance (mm^2) from point noise of the pose at a point (3,) along a normal (3,), nominal frame."""
+    lever = np.concatenate([np.cross(point_mm - alignment.pivot_mm, normal), normal])
+    covariance = np.linalg.pinv(alignment.information, rcond=1e-14, hermitian=True)
+    return max(float(lever @ covariance @ lever), 0.0)

@@ -1,0 +1,1 @@
+"""The metal to put back, as closed solids."""

@@ -1,0 +1,1 @@
+"""What the scanner saw: points cleaned, views fused, the turntable's axis, local shape."""

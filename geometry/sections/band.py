@@ -1,0 +1,247 @@
+"""Sound points near a section, laid on the chart, and the smooth deviation through them.
+
+The deviation is a cubic tensor spline over arc length and a band of neighbouring z, penalised by its
+curvature in both directions; how strongly is estimated from the data (restricted maximum likelihood),
+apart for the edges, which erode, and the sides. A section as a whole bends off less than its form does:
+how much its motion may curve along the span is estimated apart.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from geometry.kernels.profile import band_bins, band_misfit, cubic_weights
+from geometry.kernels.profile_spline import (
+    Penalty,
+    SplineFit,
+    Sums,
+    curvature_penalty,
+    eliminate,
+    fit_spline,
+    gather,
+)
+from geometry.sections.chart import NODES, Chart, Motion, SectionSettings, edge_width, outward_normals
+from geometry.sections.curve import centroid, centroid_gradient, node_shares
+from geometry.types import Bools, Floats
+
+_PILOT_POINTS = 10_000  # of a band, to tell outliers ...
+_BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # of what is told from outliers: sides, edges, along the span
+_START = np.array([5e4, 5e4, 1e8])  # of the search for the strengths: those of a blade in service
+_RIGID_PRIOR = np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0  # weak: `find_motion` has taken most
+_PILOT_BINS = (2, 4)  # ... in each knot span along the arc, and across
+_BINS = (4, 8)  # the same for all points
+_LIKELIER = 9.0  # twice the gain in log likelihood
+_ARM_MM = 10.0  # a turn counts as the movement of a point so far from the centroid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Knots:
+    """Where the deviation spline of one band has its coefficients: p along the arc, q across."""
+
+    p: int
+    q: int
+    low_mm: float
+    step_mm: float
+
+    def u(self, node: Floats) -> Floats:
+        """Knot spans of node coordinates."""
+        return node * (self.p / NODES)
+
+    def v(self, z_mm: Floats) -> Floats:
+        """Knot spans of heights."""
+        return (z_mm - self.low_mm) / self.step_mm
+
+    def across(self, z_mm: float) -> Floats:
+        """Weights (q,) of the coefficients of a row at a height."""
+        v = self.v(np.array([z_mm]))
+        first = np.clip(v.astype(np.int64), 0, self.q - 4)
+        across = np.zeros(self.q)
+        across[first[0] : first[0] + 4] = cubic_weights(v, first)[0]
+        return across
+
+    def weights(self, gradients: Floats, z_mm: float) -> Floats:
+        """Weights (p, q, n) of the coefficients in n functions (n, NODES) of the node displacements."""
+        weights: Floats = self.along(gradients)[:, None, :] * self.across(z_mm)[:, None]
+        return weights
+
+    def along(self, gradients: Floats) -> Floats:
+        """Weights (p, n) of one row of coefficients in the same functions."""
+        weights: Floats = _basis(self.p).T @ gradients.T
+        return weights
+
+
+@lru_cache(maxsize=16)
+def _basis(p: int) -> csr_array:
+    """The splines (NODES, p) of the closed arc at the nodes."""
+    u = np.arange(NODES) * (p / NODES)
+    span = u.astype(np.int64)
+    column = (span[:, None] + np.arange(4)) % p
+    row = np.repeat(np.arange(NODES), 4)
+    return csr_array((cubic_weights(u, span).ravel(), (row, column.ravel())), shape=(NODES, p))
+
+
+def place_knots(chart: Chart, span_mm: tuple[float, float], settings: SectionSettings) -> Knots:
+    """Knots that crowd at the edges as the nodes do, `knot_mm` apart on the sides, over heights `span_mm`."""
+    half = chart.perimeter_mm / 2.0
+    refined = half + 1.77 * (settings.edge_refinement - 1.0) * edge_width(half, settings)
+    p = 2 * max(8, round(refined / settings.knot_mm))
+    low, high = span_mm
+    spans = min(max(1, round((high - low) / settings.z_knot_mm)), settings.most_z_spans)
+    return Knots(p=min(p, NODES // 4), q=spans + 3, low_mm=low, step_mm=(high - low) / spans)
+
+
+def _penalty(chart: Chart, knots: Knots, settings: SectionSettings) -> Penalty:
+    """Curvature along the arc, apart for sides (0) and edges (1), and across."""
+    spans = np.arange(knots.p, dtype=np.float64)
+    centre = chart.arc_at((spans - 1.0) % knots.p * (NODES / knots.p))
+    leading = chart.arc_mm[NODES // 2]
+    trailing = np.minimum(centre, chart.perimeter_mm - centre)
+    reach = 1.5 * edge_width(chart.perimeter_mm / 2.0, settings)
+    group = (np.minimum(np.abs(centre - leading), trailing) < reach).astype(np.int64)
+    return curvature_penalty(centre, chart.perimeter_mm, group, knots.q, knots.step_mm)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Band:
+    """Sound points near a section, taken back onto the chart."""
+
+    node: Floats  # (n,) node coordinate
+    z_mm: Floats
+    sigma_mm: Floats
+    rows: Floats  # (n, 6) signed distance, arm x, y, outward normal x, y, height in half widths of the band
+
+    def every(self, step: int) -> "Band":
+        """Every so many of the points."""
+        return Band(
+            node=self.node[::step],
+            z_mm=self.z_mm[::step],
+            sigma_mm=self.sigma_mm[::step],
+            rows=np.ascontiguousarray(self.rows[::step]),
+        )
+
+    def laid(self, knots: Knots) -> "LaidBand":
+        return LaidBand(band=self, knots=knots, u=knots.u(self.node), v=knots.v(self.z_mm))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LaidBand:
+    """A band on the knots of its spline."""
+
+    band: Band
+    knots: Knots
+    u: Floats
+    v: Floats
+
+    def sums(self, keep: Bools, penalty: Penalty, bins_a_span: tuple[int, int]) -> Sums:
+        """Weighted sums of some points: the means of small bins stand for the points in them."""
+        rows, knots = self.band.rows, self.knots
+        weight = np.where(keep, self.band.sigma_mm**-2.0, 0.0)
+        bins = band_bins(self.u, self.v, rows, weight, (knots.p, knots.q - 3), bins_a_span)
+        sums = gather(bins[:, 0], bins[:, 1], bins[:, 3], bins[:, 2], bins[:, 4:], penalty.layout)
+        return replace(
+            sums,
+            free=sums.free + np.diag(_RIGID_PRIOR),
+            square=float(weight @ rows[:, 0] ** 2),
+            count=int(np.count_nonzero(keep)),
+        )
+
+    def misfit(self, coefficients: Floats, free: Floats) -> Floats:
+        """Distance from a fit in units of each point's sigma."""
+        off: Floats = np.abs(band_misfit(self.u, self.v, self.band.rows, coefficients, free))
+        return off / self.band.sigma_mm
+
+
+def band_of(chart: Chart, z_mm: Floats, settings: SectionSettings) -> tuple[float, float]:
+    """From what height to what height points at `z_mm` (n,) take part: the sparser they are, the farther.
+
+    So the centroid of a sparse scan, too, has as much metal to stand on as it needs.
+    """
+    low, high = _limits(chart, settings.band_mm)
+    count = max(int(np.count_nonzero((z_mm >= low) & (z_mm <= high))), 1)
+    spacing_mm = np.sqrt((high - low) * chart.perimeter_mm / count)
+    half = float(np.clip(settings.band_spacings * spacing_mm, settings.band_mm, settings.widest_band_mm))
+    return _limits(chart, half)
+
+
+def _limits(chart: Chart, half_mm: float) -> tuple[float, float]:
+    """The heights of a band, as far as the chart goes."""
+    low, high = chart.section_z_mm - half_mm, chart.section_z_mm + half_mm
+    return max(low, float(chart.z_mm[0])), min(high, float(chart.z_mm[-1]))
+
+
+def onto_chart(
+    points_mm: Floats, sigma_mm: Floats, chart: Chart, motion: Motion, settings: SectionSettings
+) -> Band:
+    """The points within `capture_mm` of the moved nominal, where it stands upright enough.
+
+    On a slanted surface the distance in the plane is longer than along the normal, and so is its sigma.
+    """
+    number, place, rows = chart.lay(points_mm, motion, settings.capture_mm, settings.steepest)
+    rows[:, 5] /= settings.band_mm
+    node, z_mm, longer = place.T
+    return Band(node=node, z_mm=z_mm, sigma_mm=sigma_mm[number] * longer, rows=rows)
+
+
+def robust_fit(
+    band: Band, chart: Chart, span_mm: tuple[float, float], settings: SectionSettings
+) -> tuple[Bools, Knots, SplineFit]:
+    """Which points the profile passes through, the knots, and the fit to these points.
+
+    What is kept is decided on a share of the points and a fixed smoothness; the last fit takes them all.
+    """
+    knots = place_knots(chart, span_mm, settings)
+    penalty = _penalty(chart, knots, settings)
+    laid = band.laid(knots)
+    few = band.every(max(1, len(band.node) // _PILOT_POINTS)).laid(knots)
+    keep = np.ones(len(few.u), bool)
+    for limit in (2.0 * settings.outlier, settings.outlier):
+        pilot = eliminate(few.sums(keep, penalty, _PILOT_BINS), penalty, _BENDING_PER_MM**-2.0)
+        coefficients = pilot.values(penalty.layout)
+        misfit = few.misfit(coefficients, pilot.free)
+        most = limit * 1.4826 * float(np.median(misfit))
+        keep = misfit <= most
+    keep = laid.misfit(coefficients, pilot.free) <= most
+    fit = fit_spline(laid.sums(keep, penalty, _BINS), penalty, _START)
+    return keep, knots, _steadied(fit, knots, chart.curve_mm)
+
+
+def _steadied(fit: SplineFit, knots: Knots, nominal_mm: Floats) -> SplineFit:
+    """The fit with the motion of whole sections along the span as straight as the data allow.
+
+    Centroid and turn are sums over the whole arc; left as free to curve as the form beside them, they would
+    be no better than a few mm of height make them. Their second differences along z are taken for
+    draws of one variance each, which maximum likelihood gives.
+    """
+    bend = np.diff(np.eye(knots.q), 2, axis=0)
+    along = knots.along(_motion_gradients(nominal_mm))
+    weights = (along[:, None, :, None] * bend.T[None, :, None, :]).reshape(knots.p, knots.q, -1)
+    curved = np.einsum("pq,pqn->n", fit.coefficients, weights)
+    covariance = fit.covariance(weights, np.zeros((0, len(curved))))
+    blocks = np.arange(len(curved)).reshape(3, -1)
+    variance = [_excess(curved[block], covariance[np.ix_(block, block)]) for block in blocks]
+    return fit.held(weights, np.repeat(variance, blocks.shape[1]))
+
+
+def _motion_gradients(nominal_mm: Floats) -> Floats:
+    """(3, NODES): growth of centroid x, y and of the turn times `_ARM_MM` with the nodes' displacements."""
+    arm, normals = nominal_mm - centroid(nominal_mm), outward_normals(nominal_mm)
+    lever = node_shares(nominal_mm) * (normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1])
+    weighted = lever / node_shares(nominal_mm)
+    return np.vstack([centroid_gradient(nominal_mm), _ARM_MM * lever / float(lever @ weighted)])
+
+
+def _excess(values: Floats, covariance: Floats) -> float:
+    """The variance of independent draws that, seen with a `covariance`, most likely give the values.
+
+    None, unless it makes the values much likelier than noise alone does: three standard deviations' worth.
+    """
+    noise, axes = np.linalg.eigh(covariance)
+    noise = np.maximum(noise, 1e-9 * noise[-1])
+    square = (axes.T @ values) ** 2
+    tried = np.concatenate([[1e-6], np.logspace(-2.0, 5.0, 57)]) * float(noise.mean())
+    total = noise + tried[:, None]
+    cost = np.log(total).sum(axis=1) + (square / total).sum(axis=1)
+    best = int(np.argmin(cost))
+    return float(tried[best if cost[best] < cost[0] - _LIKELIER else 0])

@@ -1,0 +1,104 @@
+"""How far a profile is off its nominal: extremes, the share out of tolerance, waviness.
+
+Deviations (m,) are signed distances at the nodes, positive outside; `share_mm` (m,) is the arc that each
+node stands for.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.sections.curve import Estimate
+from geometry.types import Bools, Floats, Ints
+
+SIDES = ("le", "ss", "te", "ps")  # as `NominalSection.side` numbers them: edges, suction, pressure side
+
+
+def extremes(deviation_mm: Floats, seen: Bools, side: Ints) -> dict[str, Estimate]:
+    """Largest and smallest signed distance to the nominal over the seen nodes: of all, and of each side."""
+    parts = {"": seen, **{f"{name}_": seen & (side == index) for index, name in enumerate(SIDES)}}
+    found = {}
+    for name, part in parts.items():
+        if part.any():
+            found[f"{name}profile_max_mm"] = _at(deviation_mm, highest(deviation_mm, part))
+            found[f"{name}profile_min_mm"] = _at(deviation_mm, highest(-deviation_mm, part))
+    return found
+
+
+def highest(deviation_mm: Floats, part: Bools) -> int:
+    """The node of a part with the largest deviation."""
+    return int(np.argmax(np.where(part, deviation_mm, -np.inf)))
+
+
+def _at(deviation_mm: Floats, node: int) -> Estimate:
+    gradient = np.zeros(len(deviation_mm))
+    gradient[node] = 1.0
+    return Estimate(value=float(deviation_mm[node]), gradient=gradient)
+
+
+def share_beyond(deviation_mm: Floats, share_mm: Floats, tolerance_mm: Floats | float) -> float:
+    """The fraction of the arc whose |deviation| is more than the tolerance."""
+    return float(share_mm[np.abs(deviation_mm) > tolerance_mm].sum() / share_mm.sum())
+
+
+def share_beyond_sigma(
+    deviation_mm: Floats, sigma_mm: Floats, share_mm: Floats, tolerance_mm: float
+) -> float:
+    """Sigma of `share_beyond`: half the way from where every node is a sigma better to a sigma worse.
+
+    So much at most, for it takes the errors of all nodes for one: a bound, no Gaussian's sigma, about one
+    and a half times what a fraction between 0 and 1 scatters by.
+    """
+    better = share_beyond(deviation_mm, share_mm, tolerance_mm + sigma_mm)
+    worse = share_beyond(deviation_mm, share_mm, np.maximum(tolerance_mm - sigma_mm, 0.0))
+    return 0.5 * (worse - better)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WaveBand:
+    """The harmonics (2 k, m) of a closed arc whose wavelengths lie in a band, orthonormal over the arc."""
+
+    harmonics: Floats
+    share_mm: Floats
+
+    def waves(self, deviation_mm: Floats) -> Floats:
+        """The waviness (m,): what the deviation has in the band."""
+        waves: Floats = (self.harmonics @ (self.share_mm * deviation_mm)) @ self.harmonics
+        return waves
+
+    def rms(self, deviation_mm: Floats) -> Estimate:
+        """Root mean square of the waviness over the arc."""
+        waves = self.waves(deviation_mm)
+        total = float(self.share_mm.sum())
+        value = float(np.sqrt((self.share_mm @ waves**2) / total))
+        gradient = self.share_mm * waves / (total * value) if value > 0.0 else np.zeros(len(waves))
+        return Estimate(value=value, gradient=gradient)
+
+    def height(self, deviation_mm: Floats) -> Estimate:
+        """Height of the waviness from its lowest to its highest place."""
+        waves = self.waves(deviation_mm)
+        top, foot = int(np.argmax(waves)), int(np.argmin(waves))
+        lift = (self.harmonics[:, top] - self.harmonics[:, foot]) @ self.harmonics
+        return Estimate(value=float(waves[top] - waves[foot]), gradient=lift * self.share_mm)
+
+    def rms_sigma(self, rms_mm: float, along: float, covariance: Floats) -> float:
+        """Sigma of the RMS: `along` that of its gradient, with what the noise adds to it.
+
+        `covariance` (2 k, 2 k) of the amplitudes: noise makes waves of its own, and a square does not
+        average out.
+        """
+        noise = float(np.trace(covariance)) / float(self.share_mm.sum())
+        added = rms_mm - float(np.sqrt(max(rms_mm**2 - noise, 0.0)))
+        return float(np.hypot(along, added))
+
+
+def wave_band(arc_mm: Floats, share_mm: Floats, wave_mm: tuple[float, float]) -> WaveBand:
+    """The harmonics with wavelengths `wave_mm` (shortest, longest) of nodes at `arc_mm` (m,).
+
+    An ideal band pass over the closed arc: no run-in, no run-out.
+    """
+    perimeter = float(share_mm.sum())
+    first, last = int(np.ceil(perimeter / wave_mm[1])), int(perimeter / wave_mm[0])
+    phase = 2.0 * np.pi * np.outer(np.arange(first, last + 1), arc_mm) / perimeter
+    harmonics = np.sqrt(2.0 / perimeter) * np.vstack([np.cos(phase), np.sin(phase)])
+    return WaveBand(harmonics=harmonics, share_mm=share_mm)
