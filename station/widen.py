@@ -24,6 +24,7 @@ def widened(found: Measurement, axis_mm: float) -> Measurement:
     """
     return replace(
         found,
+        axis_mm=axis_mm,
         sections=tuple(_section(section, axis_mm) for section in found.sections),
         line=None if found.line is None else _line(found.line, found.sections, axis_mm),
         form_mm=wider(found.form_mm, axis_mm),
