@@ -30,7 +30,6 @@ from geometry.registration.uncertainty import certainty
 from geometry.sections.airfoil import SectionSettings, measure_sections
 from geometry.transforms import apply, inverse, log
 from geometry.types import Floats, Measurand
-from simulators.calibration_file import calibrated_axis
 from simulators.damage_solids import Cut
 from simulators.presets import CutMaker, broken_corner, repairable_nick, repairable_pit
 from simulators.sections import SectionTruth
@@ -42,6 +41,7 @@ from tests.geometry.captures import (
     Cutter,
     Inspected,
     Known,
+    believed_axis,
     capture,
     displacement_mm,
     exact_axis,
@@ -157,7 +157,7 @@ def main() -> None:
     print(f"{'':9} {'seed':>4} {'points':>7} {'known':>7} {'true':>7} {'sigmas':>6}", end="")
     print(f" {'found':>6} {'false':>5} {'sound':>8} {'lost':>8} {'nominal':>8}", end="")
     print(f" {'place':>7} {'/2s':>4} {'profile':>7} {'/2s':>4} {'turn':>7} {'/2s':>4} {'CPU s':>6}  volumes")
-    for label, axis_of in (("exact axis", exact_axis), ("calibrated axis", calibrated_axis)):
+    for label, axis_of in (("exact axis", exact_axis), ("calibrated axis", believed_axis)):
         print(label)
         for name, blade in real.part_numbers().items():
             for seed in range(seeds):

@@ -1,6 +1,6 @@
-"""The damage-free twin against blades in closed form: thesis section 5.5 re-made, six kinds of wear, peers.
+"""The damage-free twin against blades in closed form: thesis section 5.5 re-made, and six kinds of wear.
 
-    python -m benchmarks.twin [--full] [--without-peers]
+    python -m benchmarks.twin [--full]
 
 Errors are distances (mm) of the twin's vertices, on the side of the airfoil, to the true undamaged surface;
 the fit is not told which points are damage but by a mask that it corrects. Noise is the standard deviation
@@ -11,8 +11,7 @@ twin 0.0021 and 0.0041, with noise 0.0080 and 0.0060; 44 minutes and 54 seconds 
 - ends: over sound metal within 3 mm of the ends of the airfoil;
 - ratio: root mean square of error over stated sigma where metal is lost; 1 is honest.
 
-Peers get the points of the damage taken out by hand and one mesh with the product; times are CPU seconds of
-one thread.
+Times are CPU seconds of one thread.
 """
 
 import argparse
@@ -21,8 +20,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
-from trimesh.registration import nricp_amberg, nricp_sumner
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.blade.solid import slice_loops
@@ -219,44 +216,9 @@ def wear(nominal: Nominal, name: str, noise_mm: float, seeds: int) -> None:
     print(f"{name:17} {noise_mm:6.3f} " + " ".join(f"{value:8.4f}" for value in shown), flush=True)
 
 
-def amberg(source: trimesh.Trimesh, target: trimesh.Trimesh) -> Floats:
-    steps = [[stiffness, 0.0, 0.0, 10] for stiffness in (0.01, 0.002, 0.0005, 0.0001)]
-    return np.asarray(
-        nricp_amberg(source, target, use_faces=False, steps=steps, distance_threshold=0.01, eps=1e-5)
-    )
-
-
-def sumner(source: trimesh.Trimesh, target: trimesh.Trimesh) -> Floats:
-    return np.asarray(nricp_sumner(source, target, use_faces=False, distance_threshold=0.01))
-
-
-def peers(pitch_mm: float) -> None:
-    """The product and each peer on one mesh and one scan: time as a ratio to the product's, mean errors."""
-    known = case(blades.SHAPES["service"], PITCH_MM, 0.01, 1, POINTS)
-    nominal = nominal_of(pitch_mm, 0.25)
-    start_s = time.process_time()
-    twin = fit_twin(known.cloud, known.broken, in_place(), nominal, TwinSettings())
-    own_s = time.process_time() - start_s
-    error = errors(known, twin)
-    count = len(nominal.mesh.vertices_mm)
-    print(f"{count:8d}  bladecell       1.0  {np.abs(error.off_mm).mean():.4f}", flush=True)
-    source = trimesh.Trimesh(nominal.mesh.vertices_mm, nominal.mesh.faces, process=False)
-    seen_mm = known.cloud.points_mm[~known.broken]
-    target = trimesh.Trimesh(seen_mm, np.zeros((0, 3), int), process=False)
-    z_mm = nominal.mesh.vertices_mm[:, 2]
-    on_side = (z_mm > 2.0) & (z_mm < blades.SPAN_MM - 1e-3)
-    for name, fit in (("nricp_amberg", amberg), ("nricp_sumner", sumner)):
-        start_s = time.process_time()
-        moved_mm = fit(source.copy(), target)
-        ratio = (time.process_time() - start_s) / own_s
-        off_mm = np.abs(known.truth.distance(moved_mm[on_side]))
-        print(f"{count:8d}  {name:14} {ratio:5.1f}  {off_mm.mean():.4f}", flush=True)
-
-
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    options.add_argument("--full", action="store_true", help="five seeds, and peers at more vertices")
-    options.add_argument("--without-peers", action="store_true")
+    options.add_argument("--full", action="store_true", help="five seeds")
     chosen = options.parse_args()
     coarse = nominal_of(0.7, 0.12)
     fit_twin(*_warm(), coarse, TwinSettings())  # kernels compiled
@@ -271,10 +233,6 @@ def main() -> None:
     for name in FIELDS:
         for noise_mm in NOISES_MM:
             wear(coarse, name, noise_mm, 5 if chosen.full else 1)
-    if not chosen.without_peers:
-        print("\nvertices  method          time  mean error")
-        for pitch_mm in (2.4, 1.4) if chosen.full else (2.4,):
-            peers(pitch_mm)
 
 
 def _warm() -> tuple[Cloud, Bools, Alignment]:

@@ -17,6 +17,7 @@ from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
 from geometry.scan.calibrate import AxisCalibration
 from geometry.scan.clean import clean
 from geometry.scan.fuse import fuse
+from geometry.scan.overlap import refine_axis
 from geometry.transforms import apply, inverse
 from geometry.types import Bools, Cloud, Floats, Mesh, View
 from simulators.calibration_file import SIGMA_AXIS_OFFSET_MM, SIGMA_AXIS_TILT_DEG, calibrated_axis
@@ -32,7 +33,7 @@ from simulators.wear import NominalBlade, WornBlade, worn_blade
 VIEWS = 12
 
 Cutter = Callable[[WornBlade, np.random.Generator], Cut]
-Axis = Callable[[Rig, int], Floats]  # rig, seed -> T_scanner_table0 as it is believed to be
+Axis = Callable[[Rig, int], AxisCalibration]  # rig, seed -> the axis as it is believed to stand
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,9 +72,18 @@ def nominal_of(blade: NominalBlade) -> Nominal:
     return prepare_nominal(mesh_of(blade.airfoil.solid), settings)
 
 
-def exact_axis(rig: Rig, _seed: int) -> Floats:
-    """The axis as it truly stands."""
-    return rig.T_scanner_table0
+def exact_axis(rig: Rig, _seed: int) -> AxisCalibration:
+    """The axis as it truly stands, known without doubt."""
+    return AxisCalibration(T_scanner_table0=rig.T_scanner_table0, sigma_offset_mm=0.0, sigma_tilt_deg=0.0)
+
+
+def believed_axis(rig: Rig, seed: int) -> AxisCalibration:
+    """The axis as the calibration of a simulated cell gives it."""
+    return AxisCalibration(
+        T_scanner_table0=calibrated_axis(rig, seed),
+        sigma_offset_mm=SIGMA_AXIS_OFFSET_MM,
+        sigma_tilt_deg=SIGMA_AXIS_TILT_DEG,
+    )
 
 
 def capture(
@@ -81,7 +91,7 @@ def capture(
     cutters: Sequence[Cutter],
     noise_mm: float,
     seed: int,
-    axis_of: Axis = calibrated_axis,
+    axis_of: Axis = believed_axis,
     pitch_mm: float | None = None,
 ) -> Capture:
     """A worn blade with these damages, in twelve views; pixels of `pitch_mm`, or those of the product."""
@@ -98,12 +108,7 @@ def capture(
         rng=rng,
     )
     rig = rig_of(blade, seed, pitch_mm)
-    axis = AxisCalibration(
-        T_scanner_table0=axis_of(rig, seed),
-        sigma_offset_mm=SIGMA_AXIS_OFFSET_MM,
-        sigma_tilt_deg=SIGMA_AXIS_TILT_DEG,
-    )
-    return Capture(part=part, worn=worn, views=seen(part, rig, seed), axis=axis)
+    return Capture(part=part, worn=worn, views=seen(part, rig, seed), axis=axis_of(rig, seed))
 
 
 def seen(part: SimPart, rig: Rig, seed: int) -> tuple[View, ...]:
@@ -119,7 +124,9 @@ def seen(part: SimPart, rig: Rig, seed: int) -> tuple[View, ...]:
 def inspect(taken: Capture, nominal: Nominal, noise_mm: float) -> Inspected:
     """The chain of the product, from views to patches. Raises `CannotMeasure` where it stops."""
     start_s = process_time()
-    cloud = clean(fuse(taken.views, taken.axis, max(noise_mm, SIGMA_MM)))
+    sigma_mm = max(noise_mm, SIGMA_MM)
+    refined = refine_axis(taken.views, taken.axis, sigma_mm)
+    cloud = clean(fuse(taken.views, refined.axis, sigma_mm))
     alignment = register(cloud, nominal)
     mask = mask_damage(cloud, alignment, nominal)
     twin = fit_twin(cloud, mask, alignment, nominal, TwinSettings())

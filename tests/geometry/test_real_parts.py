@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from geometry.blade.solid import check_solid
+from geometry.registration.register import register
+from geometry.scan.clean import clean
+from geometry.scan.fuse import fuse
 from geometry.transforms import apply, inverse
 from geometry.types import Zone
 from simulators.damage_solids import Cut, edge_nick, pit
+from simulators.recipe import SIGMA_MM
 from simulators.solids import loop_area_mm2, slice_loops, to_manifold
 from simulators.wear import WornBlade
 from tests.geometry import real_parts as real
@@ -70,6 +74,21 @@ def test_the_pose_is_that_of_the_fit_that_knows_the_damage() -> None:
     assert displacement_mm(T, known.T_true, nominal) < 0.03
     assert found.mask[known.off_mm < -0.05].mean() > 0.97
     assert found.mask[known.sound].mean() < 0.03
+
+
+def test_a_thin_scan_with_its_tip_seen_does_not_slide_down_the_span() -> None:
+    """A row of nearly constant section: only tip and root tell where along the screw it stands."""
+    blade = real.row("stator 1")
+    cutters = [
+        lambda worn, rng: edge_nick(
+            worn.airfoil, "leading_edge", 0.65, 1.2 * blade.scale, 6.0 * blade.scale, rng
+        ),
+        lambda worn, rng: pit(worn.airfoil, 0.4, 0.5, 1.0 * blade.scale, 3.5 * blade.scale, rng),
+    ]
+    taken = capture(blade, cutters, NOISE_MM, 1, exact_axis, 0.7 * min(1.0, blade.scale + 0.05))
+    cloud = clean(fuse(taken.views, taken.axis, SIGMA_MM))
+    T = register(cloud, nominal_of(blade)).T_nominal_scan
+    assert displacement_mm(T, known_of(taken, cloud).T_true, nominal_of(blade)) < 0.05
 
 
 def test_the_twin_lies_on_the_worn_part() -> None:
