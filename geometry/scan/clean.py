@@ -11,6 +11,9 @@ from geometry.kernels.quadric import plane_heights
 from geometry.scan.neighbourhood import Neighboured
 from geometry.types import Bools, Cloud, Floats, Ints
 
+STEPS = 30
+FULL = 0.96  # of the points that may be kept: enough to stop seeking a finer grid
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanSettings:
@@ -81,16 +84,16 @@ def _thin(cloud: Cloud, most_points: int) -> Cloud:
     if len(cloud) <= most_points:
         return cloud
     low_mm, high_mm = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
-    finest_mm, coarsest_mm = 0.0, float((high_mm - low_mm).max()) + 1e-9
-    for _ in range(30):
-        cell_mm = 0.5 * (finest_mm + coarsest_mm)
-        if len(np.unique(_cells(cloud.points_mm, low_mm, cell_mm))) > most_points:
-            finest_mm = cell_mm
-        else:
-            coarsest_mm = cell_mm
-        if coarsest_mm - finest_mm < 1e-3 * coarsest_mm:
+    widest_mm = float((high_mm - low_mm).max()) + 1e-9
+    finest_mm, cell_mm = widest_mm, widest_mm / np.sqrt(most_points)
+    for _ in range(STEPS):
+        count = len(np.unique(_cells(cloud.points_mm, low_mm, cell_mm)))
+        if count <= most_points:
+            finest_mm = min(finest_mm, cell_mm)
+        if FULL * most_points <= count <= most_points:
             break
-    return _select(cloud, _nearest_to_middle(cloud.points_mm, low_mm, coarsest_mm))
+        cell_mm *= np.sqrt(2.0 * count / ((1.0 + FULL) * most_points))  # cells on a surface go by its area
+    return _select(cloud, _nearest_to_middle(cloud.points_mm, low_mm, finest_mm))
 
 
 def _cells(points_mm: Floats, low_mm: Floats, cell_mm: float) -> Ints:
