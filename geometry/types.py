@@ -104,6 +104,10 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points_mm)
 
+    def of(self, chosen: Bools | Ints) -> "Cloud":
+        """The chosen points, by flag or index, and nothing else that the cloud may bring along."""
+        return Cloud(points_mm=self.points_mm[chosen], sigma_mm=self.sigma_mm[chosen], view=self.view[chosen])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mesh:

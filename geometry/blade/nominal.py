@@ -4,7 +4,7 @@ import ctypes
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import trimesh
@@ -297,21 +297,29 @@ def read_nominal(path: Path, units: Literal["mm", "inch"]) -> Mesh:
     Raises `BadMesh`, one line that names the file and the fault, for anything else.
     """
     try:
-        vertices, faces = _load_triangles(path)
-        mesh = merge_vertices(vertices * MM_PER_UNIT[units], faces)
-        check_solid(mesh)
+        if path.suffix.lower() not in ENDINGS:
+            raise BadMesh(f"ending {path.suffix!r} is none of {', '.join(ENDINGS)}")
+        if not path.is_file():
+            raise BadMesh("no such file")
+        return read_solid(path, MM_PER_UNIT[units])
     except BadInput as fault:
         raise BadMesh(f"{path}: {fault}") from None
+
+
+def read_solid(source: Path | BinaryIO, mm_per_unit: float, kind: str | None = None) -> Mesh:
+    """The closed, oriented solid of a mesh file, in mm; `kind` is the ending of one that is open already.
+
+    Raises `BadMesh`, one line that names the fault.
+    """
+    vertices, faces = _load_triangles(source, kind)
+    mesh = merge_vertices(vertices * mm_per_unit, faces)
+    check_solid(mesh)
     return mesh
 
 
-def _load_triangles(path: Path) -> tuple[Floats, Ints]:
-    if path.suffix.lower() not in ENDINGS:
-        raise BadMesh(f"ending {path.suffix!r} is none of {', '.join(ENDINGS)}")
-    if not path.is_file():
-        raise BadMesh("no such file")
+def _load_triangles(source: Path | BinaryIO, kind: str | None) -> tuple[Floats, Ints]:
     try:
-        loaded = trimesh.load_mesh(path, process=False)
+        loaded = trimesh.load_mesh(source, file_type=kind, process=False)
         vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     except Exception as fault:  # the readers raise whatever a damaged file makes them stumble over

@@ -9,9 +9,10 @@ from geometry.deformation.ground import Ground, prepare_ground
 from geometry.deformation.kriging import Sample, Wear, fit_wear, likeliest_prior, sample_of, typical_prior
 from geometry.deformation.moved_mesh import at_nodes, at_vertices, form_deviation
 from geometry.deformation.offset import Offset, fit_offset
-from geometry.deformation.votes import NO_NOISE_MM, Found, compare, gather, screen, spread, tukey
+from geometry.deformation.votes import NO_NOISE_MM, Found, compare, gather, screen
 from geometry.errors import CannotFitTwin
 from geometry.registration.register import Alignment
+from geometry.robust import TUKEY, biweight, spread
 from geometry.scan.surface import near_each_other
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh
@@ -148,7 +149,7 @@ def _sample(
     share_mm2 = votes.noise_mm**2 / np.maximum(votes.count, 1.0)
     some = votes.count > 0.0
     misfit_mm2 = max(spread(residual_mm[some]) ** 2 - float(np.median(share_mm2[some])), NO_NOISE_MM**2)
-    weight = tukey(residual_mm, np.sqrt(misfit_mm2 + share_mm2 + (0.5 * loose_mm) ** 2))
+    weight = biweight(residual_mm, TUKEY * np.sqrt(misfit_mm2 + share_mm2 + (0.5 * loose_mm) ** 2))
     held = some & (weight > 1e-3)
     variance_mm2 = (share_mm2 + (FACETS * damage_mm) ** 2)[held] / weight[held]
     return sample_of(ground.lattice, votes.centre_mm[held], votes.normals[held], goal_mm[held], variance_mm2)

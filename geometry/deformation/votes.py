@@ -10,6 +10,7 @@ from geometry.deformation.ground import Ground
 from geometry.deformation.offset import Nodes
 from geometry.errors import CannotFitTwin
 from geometry.kernels.graph import dilate, grow
+from geometry.robust import spread
 from geometry.types import Bools, Floats, Ints
 
 NO_NOISE_MM = 1e-5  # least scatter believed
@@ -81,11 +82,6 @@ def gather(found: Found, chosen: Bools, owner: Ints, nodes: Nodes) -> Votes:
     )
 
 
-def spread(values: Floats) -> float:
-    """Standard deviation about zero, robust: from the median absolute value."""
-    return 1.4826 * float(np.median(np.abs(values)))
-
-
 def screen(found: Found, ground: Ground, damage_mm: float, rings: int) -> Bools:
     """Which points (n,) lie on sound surface: their node does not stand out, nor they of it.
 
@@ -115,9 +111,3 @@ def _medians(owner: Ints, values: Floats, size: int) -> tuple[Floats, Bools]:
     medians = np.zeros(size)
     medians[some] = values[order[(last - count + (count - 1) // 2)[some]]]
     return medians, some
-
-
-def tukey(residuals: Floats, scale: Floats) -> Floats:
-    """Tukey's biweight (n,): 1 at 0, 0 beyond 4.685 scales."""
-    u = np.minimum(np.abs(residuals) / (4.685 * scale), 1.0)
-    return np.asarray((1.0 - u * u) ** 2)

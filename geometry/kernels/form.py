@@ -3,12 +3,12 @@
 import numpy as np
 from numba import njit
 
-from geometry.kernels.neighbours import margin
+from geometry.kernels.neighbours import insert, margin
 from geometry.kernels.quadric import cholesky_solve
+from geometry.robust import NORMAL, TUKEY
 from geometry.types import Floats, Ints
 
 MOTIONS = 10  # shifts, turns, thickening and its slope
-TUKEY = 4.685
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -65,7 +65,7 @@ def local_fits(
                 for a in range(MOTIONS):
                     fitted += rows[j, a] * right[a]
                 residual[j] = abs(values[members[i, j]] - fitted)
-            scale = TUKEY * max(1.4826 * np.median(residual), 1e-6)
+            scale = TUKEY * max(NORMAL * np.median(residual), 1e-6)
             for j in range(k):
                 weights[j] = closeness[j] * max(1.0 - (residual[j] / scale) ** 2, 0.0) ** 2
         fits[i] = right
@@ -94,39 +94,9 @@ def blend(
     """
     values = np.empty(len(points))
     near2, near, row = np.empty(nearest), np.empty(nearest, np.int64), np.empty(MOTIONS)
-    at = np.empty(3, np.int64)
+    grid = (order, starts, low, cell, cells)
     for i in range(len(points)):
-        for axis in range(3):
-            at[axis] = min(max(int((points[i, axis] - low[axis]) / cell), 0), cells[axis] - 1)
-        near2[:] = np.inf
-        inside = margin(points[i, 0], points[i, 1], points[i, 2], low, cell, at[0], at[1], at[2])
-        for shell in range(max(cells[0], cells[1], cells[2]) + 1):
-            for a in range(max(0, at[0] - shell), min(cells[0] - 1, at[0] + shell) + 1):
-                for b in range(max(0, at[1] - shell), min(cells[1] - 1, at[1] + shell) + 1):
-                    rim = abs(a - at[0]) == shell or abs(b - at[1]) == shell
-                    for c in range(max(0, at[2] - shell), min(cells[2] - 1, at[2] + shell) + 1):
-                        if not rim and abs(c - at[2]) != shell:
-                            continue
-                        key = (a * cells[1] + b) * cells[2] + c
-                        for j in range(starts[key], starts[key + 1]):
-                            q, away2 = order[j], 0.0
-                            for axis in range(3):
-                                d = points[i, axis] - nodes[q, axis]
-                                away2 += d * d
-                            if away2 >= near2[nearest - 1]:
-                                continue
-                            for axis in range(3):
-                                e = turn * (normals[i, axis] - node_normals[q, axis])
-                                away2 += e * e
-                            if away2 < near2[nearest - 1]:
-                                t = nearest - 1
-                                while t > 0 and near2[t - 1] > away2:
-                                    near2[t], near[t] = near2[t - 1], near[t - 1]
-                                    t -= 1
-                                near2[t], near[t] = away2, q
-            reach = shell * cell + inside
-            if near2[nearest - 1] <= reach * reach:
-                break
+        _closest_nodes(points[i], normals[i], nodes, node_normals, turn, grid, near, near2)
         widest = (1.05 * np.sqrt(near2[nearest - 1]) + 1e-9) ** 2
         total, value = 0.0, 0.0
         for t in range(nearest):
@@ -143,3 +113,37 @@ def blend(
             total += weight
         values[i] = value / total
     return values
+
+
+@njit(cache=True, nogil=True)
+def _closest_nodes(point, normal, nodes, node_normals, turn, grid, near, near2):  # type: ignore[no-untyped-def]
+    """Fill `near` and `near2` (k,) with the k closest nodes and their squared distances, ascending."""
+    order, starts, low, cell, cells = grid
+    k = len(near)
+    near2[:] = np.inf
+    at = np.empty(3, np.int64)
+    for axis in range(3):
+        at[axis] = min(max(int((point[axis] - low[axis]) / cell), 0), cells[axis] - 1)
+    inside = margin(point[0], point[1], point[2], low, cell, at[0], at[1], at[2])
+    for shell in range(max(cells[0], cells[1], cells[2]) + 1):
+        for a in range(max(0, at[0] - shell), min(cells[0] - 1, at[0] + shell) + 1):
+            for b in range(max(0, at[1] - shell), min(cells[1] - 1, at[1] + shell) + 1):
+                rim = abs(a - at[0]) == shell or abs(b - at[1]) == shell
+                for c in range(max(0, at[2] - shell), min(cells[2] - 1, at[2] + shell) + 1):
+                    if not rim and abs(c - at[2]) != shell:
+                        continue
+                    key = (a * cells[1] + b) * cells[2] + c
+                    for j in range(starts[key], starts[key + 1]):
+                        q, away2 = order[j], 0.0
+                        for axis in range(3):
+                            d = point[axis] - nodes[q, axis]
+                            away2 += d * d
+                        if away2 >= near2[k - 1]:
+                            continue
+                        for axis in range(3):
+                            e = turn * (normal[axis] - node_normals[q, axis])
+                            away2 += e * e
+                        insert(near, near2, q, away2, k)
+        reach = shell * cell + inside
+        if near2[k - 1] <= reach * reach:
+            break

@@ -141,7 +141,7 @@ def nearest_in_cells(
             else:
                 near2[:] = np.inf
                 for j in range(taken):
-                    _insert(near, near2, chosen[j], chosen2[j], k)
+                    insert(near, near2, chosen[j], chosen2[j], k)
             _keep(near, near2, i, indices[i], distances[i])
             farthest = distances[i, k - 1]
 
@@ -172,7 +172,7 @@ def _find_rows(keys, key, start, stop):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _insert(near, near2, j, d2, k):  # type: ignore[no-untyped-def]
+def insert(near, near2, j, d2, k):  # type: ignore[no-untyped-def]
     """Point j at squared distance d2 put in its place of the ascending list of k."""
     if d2 < near2[k - 1]:
         t = k - 1
@@ -230,7 +230,7 @@ def _scan_box(
             c = z0
         else:
             dx, dy, dz = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
-            _insert(near, near2, j, dx * dx + dy * dy + dz * dz, len(near))
+            insert(near, near2, j, dx * dx + dy * dy + dz * dz, len(near))
             j += 1
             continue
         j = _first_from(keys, (((a << AXIS_BITS) | b) << AXIS_BITS) | c, j)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
-from geometry.kernels.profile import band_inverse, bend_times, tensor_sums, tensor_values
+from geometry.kernels.tensor_spline import band_inverse, bend_times, tensor_sums, tensor_values
 from geometry.types import Floats, Ints
 
 _BALANCED = 0.25  # dimensions: twice the gain in log likelihood by an e-fold of strength

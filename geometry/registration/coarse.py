@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from geometry.blade.nominal import Nominal
 from geometry.errors import BadInput, CannotRegister
-from geometry.registration.fit import every, fit_robust
+from geometry.registration.fit import every, fit_robust, unit_motions
 from geometry.transforms import apply, inverse, rigid
 from geometry.types import Floats
 
@@ -114,7 +114,7 @@ def _descend(
 ) -> Floats:
     """The poses (s, 4, 4) after a few damped, robust point-to-plane steps on the shell, all at once."""
     poses = starts.copy()
-    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    scale = unit_motions(nominal)
     for _ in range(steps):
         moved_mm = np.einsum("sij,nj->sni", poses[:, :3, :3], points_mm) + poses[:, None, :3, 3]
         distance_mm, nearest = shell.query(moved_mm)

@@ -17,11 +17,12 @@ from geometry.registration.fit import (
     information,
     motions,
     tukey,
+    unit_motions,
     unit_twist,
 )
-from geometry.registration.mask import robust_sigma
 from geometry.registration.register import Alignment, RegisterSettings, mask_damage, pose_covariance
 from geometry.registration.uncertainty import certainty, form_covariance
+from geometry.robust import TUKEY, robust_sigma
 from geometry.transforms import apply, exp, inverse, log
 from geometry.types import Bools, Cloud, Floats, Measurand, Unit
 
@@ -29,7 +30,6 @@ SIX = ("primary 1", "primary 2", "primary 3", "secondary 1", "secondary 2", "ter
 _STEPS = 30
 _CLOSE_MM = 1e-6  # of the surface, between two steps on six points
 _LOCAL_STEPS = 8
-_TUKEY = 4.685
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,7 +171,7 @@ def _part(cloud: Cloud, wanted: Bools, most: int) -> Cloud:
     """At most so many of the wanted points."""
     index = np.flatnonzero(wanted)
     index = index[every(len(index), most)]
-    return Cloud(points_mm=cloud.points_mm[index], sigma_mm=cloud.sigma_mm[index], view=cloud.view[index])
+    return cloud.of(index)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,7 +201,7 @@ def register_six_point(
         raise BadInput(f"six-point alignment: {np.shape(points_mm)} is not (6, 3) finite coordinates")
     feet = nominal.closest(np.ascontiguousarray(points_mm, dtype=np.float64))
     _check_each(np.abs(feet.distance_mm) > settings.off_nominal_mm, "lies off the nominal")
-    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    scale = unit_motions(nominal)
     design = motions(feet.points_mm, feet.normals, nominal.pivot_mm) * scale
     condition = float(np.linalg.cond(design))
     if not condition <= settings.most_condition:
@@ -283,7 +283,7 @@ def _local(found: Closest, foot_mm: Floats, sigma_mm: Floats) -> tuple[float, fl
     for _ in range(_LOCAL_STEPS):
         plane = np.linalg.solve(design.T @ (design * keep[:, None]), design.T @ (keep * found.distance_mm))
         residual_mm = found.distance_mm - design @ plane
-        keep = weights * tukey(residual_mm, np.ones(len(design), bool), _TUKEY)
+        keep = weights * tukey(residual_mm, np.ones(len(design), bool), TUKEY)
     covariance = np.linalg.inv(design.T @ (design * keep[:, None]))
     return float(plane[0]), float(np.sqrt(covariance[0, 0])), residual_mm
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.special import log_ndtr
 
 from geometry.blade.nominal import UP, Closest, Nominal
-from geometry.registration.mask import robust_sigma
+from geometry.robust import robust_sigma
 from geometry.types import Bools, Floats, Ints
 
 RIM_STEP_MM = 0.05

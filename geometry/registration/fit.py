@@ -6,11 +6,10 @@ import numpy as np
 
 from geometry.blade.nominal import Closest, Nominal
 from geometry.registration.ends import on_rim
-from geometry.registration.mask import robust_sigma
+from geometry.robust import TUKEY, biweight, robust_sigma
 from geometry.transforms import apply, exp
 from geometry.types import Bools, Floats, Ints
 
-TUKEY = 4.685  # 95 % efficient on normal residuals
 ANNEAL = (60.0, 40.0, 25.0, 15.0, 10.0, 7.0, 5.0, TUKEY)  # widths of the first steps, in robust sigmas
 WEAK = 1e-5  # eigenvalue a point, of a unit displacement: the surface does not feel the motion
 LONGEST_STEP_RAD = 0.3
@@ -90,7 +89,7 @@ def solve_step(
     Rotations are measured by the displacement at the surface's radius of gyration, so that eigenvalues of
     all six directions compare. Degeneracy after Zhang, Kaess and Singh (2016).
     """
-    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    scale = unit_motions(nominal)
     design = np.concatenate([motions(moved_mm, found.normals, nominal.pivot_mm), beside.design]) * scale
     weights = np.concatenate([weights, beside.weights])
     weighted = design * weights[:, None]
@@ -102,6 +101,11 @@ def solve_step(
     twist *= min(1.0, LONGEST_STEP_RAD / (float(np.linalg.norm(twist[:3])) + 1e-12))
     weak = tuple(unit_twist(vectors[:, i] * scale) for i in np.flatnonzero(~strong))
     return Step(twist=twist, weak=weak, size_mm=float(np.linalg.norm(scaled)))
+
+
+def unit_motions(nominal: Nominal) -> Floats:
+    """How much of each component (6,) of a twist displaces a point at the radius of gyration by 1 mm."""
+    return np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
 
 
 def unit_twist(twist: Floats) -> tuple[float, ...]:
@@ -130,8 +134,7 @@ def fit_robust(
 def tukey(distance_mm: Floats, used: Bools, width: float) -> Floats:
     """Tukey's biweights (n,) of the residuals, the scale from the `used` ones; 0 for the rest."""
     scale_mm = max(robust_sigma(distance_mm[used]), 1e-9) if used.any() else 1.0
-    q = np.clip(distance_mm / (width * scale_mm), -1.0, 1.0)
-    return np.where(used, (1.0 - q * q) ** 2, 0.0)
+    return np.where(used, biweight(distance_mm, width * scale_mm), 0.0)
 
 
 def fit_kept(

@@ -10,6 +10,7 @@ from geometry.kernels.form import blend, local_fits
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean, neighbourhood_median
 from geometry.kernels.neighbours import cell_index, counting_sort
 from geometry.kernels.parts import over_parts
+from geometry.robust import robust_sigma
 from geometry.types import Bools, Floats, Ints
 
 TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
@@ -44,11 +45,6 @@ class MaskSettings:
             raise BadInput(f"mask: form {self.form_mm} mm and rim {self.rim_mm} mm are no distances")
         if not 20 <= self.form_window <= self.form_nodes <= self.form_points:
             raise BadInput(f"mask: {self} has too few points for a form")
-
-
-def robust_sigma(values: Floats) -> float:
-    """Standard deviation of the values were they normal: 1.4826 of the median distance from the median."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def damaged(residual_mm: Floats, neighbours: Ints, floor_mm: float, settings: MaskSettings) -> Bools:

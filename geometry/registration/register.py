@@ -17,11 +17,13 @@ from geometry.registration.fit import (
     fit_robust,
     information,
     motions,
+    unit_motions,
     unit_twist,
 )
-from geometry.registration.mask import MaskSettings, damaged, form_of, robust_sigma
+from geometry.registration.mask import MaskSettings, damaged, form_of
 from geometry.registration.slide import LEAST, slides_mm
 from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
+from geometry.robust import robust_sigma
 from geometry.scan.neighbourhood import nearest_of
 from geometry.transforms import apply, exp, inverse
 from geometry.types import Bools, Cloud, Floats, Ints
@@ -112,7 +114,7 @@ def _thinned(cloud: Cloud, most: int) -> Cloud:
     if len(cloud) <= most:
         return cloud
     kept = every(len(cloud), most)
-    return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
+    return cloud.of(kept)
 
 
 def _settled(
@@ -123,8 +125,9 @@ def _settled(
     fit = replace(start, found=found)
     for _ in range(settings.rounds):
         sound = ~_damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, nominal, settings)
-        if (sound & felt(nominal, fit.found)).sum() < settings.least_points:
-            raise CannotRegister(f"{int(sound.sum())} scan points lie on the nominal")
+        held = int((sound & felt(nominal, fit.found)).sum())
+        if held < settings.least_points:
+            raise CannotRegister(f"{held} scan points lie on the nominal")
         fit = fit_kept(cloud.points_mm, fit, without_strays(sound, fit.found, nominal), nominal)
         turns += fit.iterations
     return held_by_ends(cloud, replace(fit, iterations=turns), sound, nominal)
@@ -187,7 +190,7 @@ def _with_ends(settled: Settled, fit: Fit, held: Held, ends: tuple[End, ...], no
     """The same points with ends beside them: covariances as that weighted least squares passes them on."""
     rows = held.rows(fit.T_nominal_scan, nominal.pivot_mm)
     weighted = rows.design.T * rows.weights
-    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    scale = unit_motions(nominal)
     unit = np.outer(scale, scale)
     both = np.linalg.inv((settled.normal_matrix + weighted @ rows.design) * unit) * unit
     share = both @ settled.normal_matrix

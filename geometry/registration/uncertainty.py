@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from geometry.blade.nominal import UP, Closest, Nominal
 from geometry.blade.solid import solid_normals
 from geometry.blade.span import on_line_mm
-from geometry.registration.fit import every, motions
+from geometry.registration.fit import every, motions, unit_motions
 from geometry.types import Bools, Floats
 
 POINTS = 12_000
@@ -37,7 +37,7 @@ def form_covariance(nominal: Nominal, moved_mm: Floats, found: Closest) -> Float
     """
     few = every(len(moved_mm), POINTS)
     feet_mm, normals = found.points_mm[few], found.normals[few]
-    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    scale = unit_motions(nominal)
     design = motions(moved_mm[few], normals, nominal.pivot_mm) * scale
     whiten = _root_inverse(design.T @ design, len(few))
     pose = design @ whiten
@@ -126,7 +126,7 @@ class Certainty:
 
 def certainty(nominal: Nominal, information: Floats, form: Floats) -> Certainty:
     """What noise and form together leave open of a pose."""
-    scale = np.concatenate([np.full(3, 1.0 / nominal.gyration_mm), np.ones(3)])
+    scale = unit_motions(nominal)
     variance, motion = np.linalg.eigh((free_inverse(information, scale) + form) / np.outer(scale, scale))
     return Certainty(sigma_mm=np.sqrt(np.maximum(variance, 0.0)), twists=motion * scale[:, None])
 

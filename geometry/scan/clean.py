@@ -44,20 +44,16 @@ def clean(cloud: Cloud, settings: CleanSettings = CleanSettings()) -> Cloud:
     if len(cloud) <= 2 * settings.kept_neighbours:
         return cloud
     order, nearest, distance_mm = sorted_nearest(cloud.points_mm, settings.kept_neighbours + 1)
-    cloud = _select(cloud, order)
+    cloud = cloud.of(order)
     strays = _strays(nearest, distance_mm, settings)
     return _thin(_without(cloud, strays | _outliers(cloud, nearest, settings), nearest), settings.most_points)
-
-
-def _select(cloud: Cloud, kept: Bools | Ints) -> Cloud:
-    return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
 
 
 def _without(cloud: Cloud, gone: Bools, nearest: Ints) -> Neighboured:
     """The cloud without the points that are gone, and the neighbours of the rest."""
     if gone.any():
         place = np.where(gone, -1, np.cumsum(~gone) - 1)
-        cloud, nearest = _select(cloud, ~gone), place[nearest[~gone]]
+        cloud, nearest = cloud.of(~gone), place[nearest[~gone]]
     return Neighboured(points_mm=cloud.points_mm, sigma_mm=cloud.sigma_mm, view=cloud.view, nearest=nearest)
 
 
@@ -93,7 +89,7 @@ def _thin(cloud: Cloud, most_points: int) -> Cloud:
         if FULL * most_points <= count <= most_points:
             break
         cell_mm *= np.sqrt(2.0 * count / ((1.0 + FULL) * most_points))  # cells on a surface go by its area
-    return _select(cloud, _nearest_to_middle(cloud.points_mm, low_mm, finest_mm))
+    return cloud.of(_nearest_to_middle(cloud.points_mm, low_mm, finest_mm))
 
 
 def _cells(points_mm: Floats, low_mm: Floats, cell_mm: float) -> Ints:

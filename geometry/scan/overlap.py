@@ -7,9 +7,10 @@ import numpy as np
 
 from geometry.kernels.neighbours import k_nearest
 from geometry.kernels.overlap import heights_over_others
-from geometry.kernels.quadric import balanced_quadrics
+from geometry.robust import spread
 from geometry.scan.calibrate import AxisCalibration
 from geometry.scan.fuse import fuse
+from geometry.scan.surface import local_shape
 from geometry.transforms import about_z, apply, exp, inverse
 from geometry.types import Bools, Floats, Ints, View
 
@@ -129,8 +130,9 @@ def _shape_in_its_view(points_mm: Floats, view: Ints) -> tuple[Floats, Floats]:
     normals, bend_per_mm = np.full(points_mm.shape, np.nan), np.full(len(points_mm), np.nan)
     for number in np.unique(view):
         mine = np.flatnonzero(view == number)
-        nearest, _ = k_nearest(points_mm[mine], min(NEIGHBOURS, len(mine)))
-        _, normals[mine], _, bend_per_mm[mine], _ = balanced_quadrics(points_mm[mine], nearest, 8, 2)
+        if len(mine) >= NEIGHBOURS:
+            shape = local_shape(points_mm[mine], candidates=NEIGHBOURS)
+            normals[mine], bend_per_mm[mine] = shape.normals, shape.mean_per_mm
     return normals, bend_per_mm
 
 
@@ -139,7 +141,7 @@ def _posterior(shared: _Shared, scale: Floats, moved: Floats) -> tuple[Floats, F
     near to the scanner, mm; `moved` (5,) is what is clipped about."""
     design = np.column_stack([shared.felt * scale, np.ones(len(shared.view))])
     left_mm = shared.height_mm + design @ moved
-    near = np.abs(left_mm) <= max(CLIP * 1.4826 * float(np.median(np.abs(left_mm))), EXACT_MM)
+    near = np.abs(left_mm) <= max(CLIP * spread(left_mm), EXACT_MM)
     design, height_mm = design[near], shared.height_mm[near]
     weight = _weight(design, height_mm, shared.of(near))
     prior = np.diag([1.0, 1.0, 1.0, 1.0, 0.0])

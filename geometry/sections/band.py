@@ -12,7 +12,6 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csr_array
 
-from geometry.kernels.profile import band_bins, band_misfit, cubic_weights
 from geometry.kernels.profile_spline import (
     Penalty,
     SplineFit,
@@ -22,6 +21,7 @@ from geometry.kernels.profile_spline import (
     fit_spline,
     gather,
 )
+from geometry.kernels.tensor_spline import band_bins, band_misfit, cubic_weights
 from geometry.sections.chart import NODES, Chart, Motion, SectionSettings, edge_width, outward_normals
 from geometry.sections.curve import centroid, centroid_gradient, node_shares
 from geometry.types import Bools, Floats

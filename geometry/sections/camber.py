@@ -6,12 +6,12 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from geometry.kernels.airfoil import inscribed_circles
+from geometry.robust import TUKEY, biweight, spread
 from geometry.sections.chart import outward_normals
 from geometry.sections.chords import Line
 from geometry.sections.curve import CamberLine, Estimate, Pair
 from geometry.types import Floats
 
-_TUKEY = 4.685  # standard deviations; 95 % efficient on Gaussian residuals
 _SPANS = 6  # of the smooth camber line
 _OFF = 2e-4  # of the chord: nearer to the smooth line than this every circle counts in full
 
@@ -58,8 +58,8 @@ def max_camber(curve_mm: Floats, camber: CamberLine, line: Line) -> Estimate:
         weighted = basis.T * (share * weight)
         pull = np.linalg.solve(weighted @ basis, weighted)
         off = height - basis @ (pull @ height)
-        scale = 1.4826 * float(np.median(np.abs(off))) + _OFF * (high - low)
-        weight = np.clip(1.0 - (off / (_TUKEY * scale)) ** 2, 0.0, None) ** 2
+        scale = spread(off) + _OFF * (high - low)
+        weight = biweight(off, TUKEY * scale)
     fine = np.linspace(low, high, 2001)
     heights = BSpline(knots, pull @ height, 3)(fine)
     top = int(np.argmax(np.abs(heights)))

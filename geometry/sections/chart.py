@@ -16,10 +16,10 @@ from geometry.blade.nominal import Nominal, NominalSection
 from geometry.errors import BadInput
 from geometry.kernels.airfoil import closed_normals, closed_steps
 from geometry.kernels.profile import lay, project, undo_motion
+from geometry.robust import TUKEY, biweight, spread
 from geometry.types import Bools, Floats, Ints
 
 NODES = 2048  # of a profile; half on each side between the edges
-_TUKEY = 4.685  # standard deviations; 95 % efficient on Gaussian residuals
 
 
 Freedom = Literal["x", "y", "rotation"]
@@ -367,8 +367,8 @@ def find_motion(chart: Chart, points_mm: Floats) -> Motion:
         back = motion.undo(some)
         foot = chart.project(back)
         residual = foot[:, 1]
-        scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
-        weight = np.clip(1.0 - (residual / (_TUKEY * scale)) ** 2, 0.0, None) ** 2 / scale**2
+        scale = spread(residual) + 1e-6
+        weight = biweight(residual, TUKEY * scale) / scale**2
         columns = rigid_columns(back, foot[:, 2:], pivot, back[:, 2] - z_mm)
         normal = columns.T @ (columns * weight[:, None]) + np.diag(prior)
         step = np.linalg.solve(normal, columns.T @ (weight * residual) - prior * total)

@@ -11,8 +11,9 @@ import numpy as np
 
 from geometry.blade.nominal import Nominal
 from geometry.errors import CannotMeasure
-from geometry.kernels.profile import cubic_weights, sort_by_height
+from geometry.kernels.profile import sort_by_height
 from geometry.kernels.profile_spline import SplineFit
+from geometry.kernels.tensor_spline import cubic_weights
 from geometry.sections.band import Knots, band_of, onto_chart, robust_fit
 from geometry.sections.chart import (
     NODES,

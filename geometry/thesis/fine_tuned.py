@@ -16,8 +16,8 @@ from geometry.errors import BadInput, CannotRegister
 from geometry.kernels.hausdorff import average_hausdorff
 from geometry.registration.coarse import principal_frame
 from geometry.registration.fit import every, felt, information, solve_step
-from geometry.registration.mask import robust_sigma
 from geometry.registration.register import Alignment
+from geometry.robust import robust_sigma
 from geometry.scan.surface import local_shape, near_each_other
 from geometry.thesis.cad_points import pitch_of, sample_cad
 from geometry.transforms import apply, inverse, rigid
@@ -82,7 +82,7 @@ def mask_thesis(cloud: Cloud, alignment: Alignment, nominal: Nominal) -> Bools:
 def _thinned(cloud: Cloud, most: int) -> Cloud:
     kept = every(len(cloud), most)
     kept = kept[near_each_other(cloud.points_mm[kept])]
-    return Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept])
+    return cloud.of(kept)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

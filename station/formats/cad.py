@@ -7,10 +7,7 @@ import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
-import trimesh
-
-from geometry.blade.solid import check_solid, merge_vertices
+from geometry.blade.nominal import read_solid
 from geometry.errors import BadInput, BadMesh
 from geometry.types import Mesh
 
@@ -34,16 +31,9 @@ def read_cad(path: Path) -> Mesh:
         raise BadMesh(f"{path}: reading STEP or IGES needs the extra: pip install 'bladecell[cad]'")
     kind = KINDS[path.suffix.lower()]
     try:
-        loaded = trimesh.load_mesh(io.BytesIO(_tessellated(path, kind)), file_type="glb", process=False)
-        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-        mesh = merge_vertices(MM_PER_READ[kind] * vertices, faces)
-        check_solid(mesh)
+        return read_solid(io.BytesIO(_tessellated(path, kind)), MM_PER_READ[kind], "glb")
     except BadInput as fault:
         raise BadMesh(f"{path}: {fault}") from None
-    except (ValueError, KeyError, IndexError, AttributeError, TypeError) as fault:
-        raise BadMesh(f"{path}: no triangles came of it: {' '.join(str(fault).split())[:200]}") from fault
-    return mesh
 
 
 def _tessellated(path: Path, kind: str) -> bytes:

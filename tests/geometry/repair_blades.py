@@ -304,7 +304,7 @@ def without(scanned: Specimen, gone: NDArray[np.bool_]) -> Specimen:
     cloud, damages = scanned.cloud, scanned.damages
     return replace(
         scanned,
-        cloud=Cloud(points_mm=cloud.points_mm[kept], sigma_mm=cloud.sigma_mm[kept], view=cloud.view[kept]),
+        cloud=cloud.of(kept),
         damages=tuple(replace(d, points=number[d.points[kept[d.points]]]) for d in damages),
         on_break=scanned.on_break[kept],
     )

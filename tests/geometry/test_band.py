@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from geometry.kernels.profile import (
-    band_bins,
-    band_misfit,
-    nearest_nodes,
-    sort_by_height,
-    steepness,
-    tensor_values,
-)
+from geometry.kernels.profile import nearest_nodes, sort_by_height, steepness
 from geometry.kernels.profile_spline import curvature_penalty, gather, solve, stencil
+from geometry.kernels.tensor_spline import band_bins, band_misfit, tensor_values
 from geometry.sections.band import band_of
 from geometry.sections.chart import Motion, SectionSettings, curvature, rigid_columns, unroll
 from geometry.sections.curve import centroid

@@ -17,10 +17,10 @@ from geometry.registration.datums import (
     register_six_point,
     service_motion,
 )
-from geometry.registration.register import Alignment
 from geometry.transforms import apply, exp, inverse, log, rigid
 from geometry.types import Cloud
 from tests.geometry import blades
+from tests.geometry.poses import in_place
 
 BLADE = blades.Blade()
 SIGMA_MM = 0.015
@@ -46,20 +46,8 @@ def seen_from(points_mm):
 def near(seed=0, size=1.0):
     """An alignment a few tenths of a millimetre off."""
     error = np.random.default_rng(seed).normal(size=6) * [1e-3, 1e-3, 2e-3, 0.1, 0.1, 0.1] * size
-    return Alignment(
-        method="airfoil",
-        T_nominal_scan=exp(error, PIVOT) @ POSE,
-        pivot_mm=PIVOT,
-        information=np.eye(6),
-        weak_directions=(),
-        rms_mm=0.02,
-        noise_mm=0.02,
-        inlier_fraction=0.9,
-        explained_fraction=0.95,
-        runner_up_ratio=9.0,
-        iterations=1,
-        converged=True,
-    )
+    start = in_place(exp(error, PIVOT) @ POSE, PIVOT[2], np.eye(6))
+    return replace(start, explained_fraction=0.95)
 
 
 @cache

@@ -5,7 +5,8 @@ import pytest
 
 from geometry.errors import BadInput
 from geometry.kernels.neighbours import k_nearest
-from geometry.registration.mask import MaskSettings, damaged, form_of, robust_sigma
+from geometry.registration.mask import MaskSettings, damaged, form_of
+from geometry.robust import robust_sigma
 
 
 def plate(rng, sigma_mm):

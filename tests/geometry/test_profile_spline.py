@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from geometry.kernels.profile import band_inverse, cubic_weights, tensor_sums, tensor_values
 from geometry.kernels.profile_spline import Penalty, curvature_penalty, fit_spline, gather, solve, stencil
+from geometry.kernels.tensor_spline import band_inverse, cubic_weights, tensor_sums, tensor_values
 
 P, Q = 16, 5
 

@@ -221,7 +221,7 @@ def test_the_order_of_the_points_does_not_matter() -> None:
     cloud = specimen.cloud
     shuffled = replace(
         specimen,
-        cloud=Cloud(points_mm=cloud.points_mm[order], sigma_mm=cloud.sigma_mm[order], view=cloud.view[order]),
+        cloud=cloud.of(order),
         damages=(replace(specimen.damages[0], points=rank[specimen.damages[0].points]),),
     )
     (patch,) = repairs_of(shuffled).patches
@@ -235,7 +235,7 @@ def test_repeated_points_change_little() -> None:
     points = specimen.damages[0].points
     repeated = replace(
         specimen,
-        cloud=Cloud(points_mm=cloud.points_mm[twice], sigma_mm=cloud.sigma_mm[twice], view=cloud.view[twice]),
+        cloud=cloud.of(twice),
         damages=(
             replace(specimen.damages[0], points=np.concatenate([points + k * count for k in range(3)])),
         ),
