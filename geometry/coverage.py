@@ -1,5 +1,6 @@
 """Was every required part of the surface seen? By zone, by area and by largest gap."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -10,25 +11,18 @@ from geometry.blade.nominal import ZONE_ORDER, Nominal
 from geometry.damage.broken import Skin, frames_along
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
+from geometry.kernels.facing import FacingMarks
 from geometry.registration.register import Alignment
 from geometry.repair.patches import RepairVolume
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Mesh, Zone
 
-SAME_SIDE = 0.3  # least cosine between the direction of a side and the skin that a scan point lies on
+SAME_SIDE = 0.3  # least cosine between the skin at a place and where a scan point lies, to show that place
 ON_PATCH_MM = 0.02  # the outer skin of a patch is the twin's; rounding and the nominal's own facets
 LEVELS = 3  # of division round a sample, in search of the largest empty disc
 
 
-def _spread_directions(count: int) -> Floats:
-    """Unit vectors (count, 3) spread evenly over the sphere: a Fibonacci lattice."""
-    index = np.arange(count) + 0.5
-    z, turn = 1.0 - 2.0 * index / count, np.pi * (1.0 + np.sqrt(5.0)) * index
-    across = np.sqrt(1.0 - z * z)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
-
-
-SIDES = _spread_directions(32)
+ToMark = Callable[[Floats, Floats], Floats]  # places (n, 3) and their normals to distances (n,), mm
 
 
 class CoverageStatus(StrEnum):
@@ -50,42 +44,14 @@ class CoverageSettings:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZoneCoverage:
     """One zone of the required surface. `covered_fraction` counts area seen or absent; the gap is
-    the diameter of the largest empty disc on what is neither."""
+    the diameter of the largest empty disc on what is neither, one within the permitted to the pitch of the
+    samples only."""
 
     zone: Zone
     covered_fraction: float
     absent_fraction: float
     largest_gap_mm: float
     status: CoverageStatus
-
-
-class _Marks:
-    """What shows a part of the surface, asked for the distance to the nearest of them on the same side.
-
-    Sides are told by `SIDES` directions: a place sees the marks whose normals lie within about 70 deg of
-    the direction nearest to its own normal. At a thin edge the marks of the other side do not count.
-    """
-
-    def __init__(self, points_mm: Floats, normals: Floats) -> None:
-        self._points_mm, self._normals = points_mm, normals
-        self._trees: dict[int, cKDTree | None] = {}
-
-    def distance_mm(self, points_mm: Floats, normals: Floats) -> Floats:
-        """Distance (n,) from each place to the nearest mark on its side; infinite where there is none."""
-        side = (normals @ SIDES.T).argmax(axis=1)
-        distance_mm = np.full(len(points_mm), np.inf)
-        for index in np.unique(side):
-            tree = self._tree(int(index))
-            if tree is not None:
-                own = side == index
-                distance_mm[own] = tree.query(points_mm[own])[0]
-        return distance_mm
-
-    def _tree(self, side: int) -> cKDTree | None:
-        if side not in self._trees:
-            facing = self._normals @ SIDES[side] > SAME_SIDE
-            self._trees[side] = cKDTree(self._points_mm[facing]) if facing.any() else None
-        return self._trees[side]
 
 
 def measure_coverage(
@@ -106,18 +72,29 @@ def measure_coverage(
     samples = nominal.samples
     seen_mm, seen_normals = _seen_skin(cloud, alignment, nominal, twin, settings.normal_mm)
     absent = _absent(samples.points_mm, twin, repairs, settings.max_gap_mm)
-    marks = _Marks(
-        np.concatenate([seen_mm, samples.points_mm[absent]]),
-        np.concatenate([seen_normals, samples.normals[absent]]),
-    )
-    empty_mm = marks.distance_mm(samples.points_mm, samples.normals)
+    marks_mm = np.concatenate([seen_mm, samples.points_mm[absent]])
+    marks_normals = np.concatenate([seen_normals, samples.normals[absent]])
+    to_mark_mm = _to_mark(marks_mm, marks_normals, nominal.settings.sample_mm)
+    empty_mm = to_mark_mm(samples.points_mm, samples.normals)
     rows = []
     for index, zone in enumerate(ZONE_ORDER):
         own = samples.zone == index
         if zone is not Zone.OUTSIDE and own.any():
-            worst_mm = _largest_empty(nominal, np.flatnonzero(own & ~absent), empty_mm, marks)
+            required = np.flatnonzero(own & ~absent)
+            worst_mm = _largest_empty(nominal, required, empty_mm, to_mark_mm, 0.5 * settings.max_gap_mm)
             rows.append(_row(zone, samples.area_mm2[own], empty_mm[own], absent[own], worst_mm, settings))
     return tuple(rows)
+
+
+def _to_mark(marks_mm: Floats, normals: Floats, cell_mm: float) -> ToMark:
+    """The distance from places on the skin to the nearest mark on the same side of the part.
+
+    At a thin edge the marks of the other side do not count.
+    """
+    if not len(marks_mm):
+        return lambda places_mm, facing: np.full(len(places_mm), np.inf)
+    marks = FacingMarks(marks_mm, normals, cell_mm)
+    return lambda places_mm, facing: marks.distance_mm(places_mm, facing, SAME_SIDE)
 
 
 def _row(
@@ -135,11 +112,14 @@ def _row(
     )
 
 
-def _largest_empty(nominal: Nominal, own: Ints, empty_mm: Floats, marks: _Marks) -> float:
-    """Radius of the largest empty disc about the samples `own` and the skin between them.
+def _largest_empty(
+    nominal: Nominal, own: Ints, empty_mm: Floats, to_mark_mm: ToMark, permitted_mm: float
+) -> float:
+    """Radius of the largest empty disc about the samples `own` and, where it may pass `permitted_mm`, the
+    skin between them.
 
     The radius changes by no more than the way from one centre to the next, so only squares round a sample
-    that may hold a larger one are divided, `LEVELS` times into nine.
+    that may hold a larger one than any found and than is permitted are divided, `LEVELS` times into nine.
     """
     if not len(own):
         return 0.0
@@ -149,13 +129,13 @@ def _largest_empty(nominal: Nominal, own: Ints, empty_mm: Floats, marks: _Marks)
     if not np.isfinite(largest_mm):
         return 0.5 * float(np.linalg.norm(np.ptp(nominal.samples.points_mm, axis=0)))  # nothing of a side
     for _ in range(LEVELS):
-        open_ = radius_mm + np.sqrt(2.0) * half_mm > largest_mm
+        open_ = radius_mm + np.sqrt(2.0) * half_mm > max(largest_mm, permitted_mm)
         half_mm /= 3.0
         finer = nominal.closest(_nine(centres_mm[open_], normals[open_], 2.0 * half_mm))
         required = nominal.airfoil_face[finer.face] & (finer.points_mm[:, 2] >= nominal.z_min_mm)
         required &= finer.points_mm[:, 2] <= nominal.z_max_mm
         centres_mm, normals = finer.points_mm[required], np.repeat(normals[open_], 9, axis=0)[required]
-        radius_mm = marks.distance_mm(centres_mm, normals)
+        radius_mm = to_mark_mm(centres_mm, normals)
         largest_mm = max(largest_mm, float(radius_mm.max(initial=0.0)))
     return largest_mm
 

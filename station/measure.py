@@ -19,7 +19,7 @@ from geometry.damage.damages import Damage, DamageKind, DamageSettings, detectio
 from geometry.deformation.twin import Twin
 from geometry.errors import CannotMeasure
 from geometry.registration.register import Alignment, mask_damage
-from geometry.repair.patches import RepairVolume, find_repairs
+from geometry.repair.patches import Patch, RepairVolume, find_repairs
 from geometry.scan.clean import CleanSettings, clean
 from geometry.scan.fuse import fuse
 from geometry.scan.overlap import refine_axis
@@ -238,14 +238,19 @@ def unexcused(measured: Measured) -> Measured:
 
 
 def with_volumes(damages: Sequence[Damage], repairs: RepairVolume | None) -> tuple[Damage, ...]:
-    """The damages, volume and lost skin of each taken from its patch where it has one."""
-    patches = {patch.damage: patch for patch in repairs.patches} if repairs else {}
-    return tuple(
-        replace(damage, volume_mm3=patches[i].volume_mm3, area_mm2=patches[i].area_mm2)
-        if i in patches
-        else damage
-        for i, damage in enumerate(damages)
-    )
+    """The damages, volume and lost skin of each taken from its patch, or with the reason why it has none."""
+    if repairs is None:
+        return tuple(damages)
+    patches = {patch.damage: patch for patch in repairs.patches}
+    return tuple(with_volume(d, patches.get(i), repairs.failures.get(i)) for i, d in enumerate(damages))
+
+
+def with_volume(damage: Damage, patch: Patch | None, failure: str | None) -> Damage:
+    if patch is not None:
+        return replace(damage, volume_mm3=patch.volume_mm3, area_mm2=patch.area_mm2)
+    if failure is not None and isinstance(damage.volume_mm3, NotMeasured):
+        return replace(damage, volume_mm3=NotMeasured(reason=failure))
+    return damage
 
 
 def deviations(points: Cloud, alignment: Alignment, nominal: Nominal) -> tuple[Floats, Floats]:

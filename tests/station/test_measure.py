@@ -301,6 +301,18 @@ def test_a_damage_has_the_volume_of_its_patch(geometry: dict[str, Any]) -> None:
     assert third == NotMeasured(reason="from its patch")
 
 
+def test_a_damage_without_a_patch_says_why(geometry: dict[str, Any]) -> None:
+    bare = replace(damage(volume=lost("from its patch")), points=np.array([3]))
+    near = replace(damage(volume=1.0), points=np.array([3]))
+    geometry["find_damages"] = (bare, near)
+    geometry["find_repairs"] = replace(
+        repairs(), failures={0: "the surface is open", 1: "the surface is open"}
+    )
+    first, second = (each.volume_mm3 for each in measured().done.damages)
+    assert first == NotMeasured(reason="the surface is open")
+    assert isinstance(second, Measurand)
+
+
 def test_a_run_keeps_time_even_of_what_failed() -> None:
     run = Run(clock=ticks(), progress=lambda step: None)
 

@@ -1,0 +1,178 @@
+"""Verdicts of the whole product against the truth: random parts, scanned, inspected from their files.
+
+    python -m benchmarks.verdicts [parts] [first seed]
+
+Each part is a blade worn at random, from half to three times what the presets allow, with up to three
+damages whose sizes are drawn on a logarithmic scale across both limits of their zone, so that many true
+values lie near a limit. Twelve views with a calibrated axis are merged, written, and inspected by
+`station.inspect` as a file from anywhere would be. The truth is what a perfect measurement would decide;
+where the scan has a larger gap than the plan allows, it is SCRAP or HOLD.
+
+HOLD is always allowed: near a limit it is the only honest word. Its reasons are listed, with how far the
+truth lies from the limit that it is nearest to, in shares of that limit. Any other word that is not the
+truth is wrong, and there must be none.
+"""
+
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from simulators.blade import Wear
+from simulators.damage_solids import Cut, edge_nick, pit, tip_corner
+from simulators.optics import OpticsSettings
+from simulators.parts import SimPart, assemble
+from simulators.presets import nominal_blade, rig_of, serial_of
+from simulators.recipe import write_plan
+from simulators.solids import Floats, NotASolid, write_point_ply
+from simulators.synth import MAX_GAP_MM, largest_gap_mm, merged_scan
+from simulators.wear import NominalBlade, WornBlade, worn_blade
+from station.inspect import inspect_scan
+
+VIEWS = 12
+WORDS = ("PASS", "REPAIR", "SCRAP", "HOLD")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """One part: what it is, what it was called and why."""
+
+    seed: int
+    truth: str
+    word: str
+    reasons: tuple[str, ...]
+    clear: float  # of the nearest limit, as a share of it
+    removed_mm3: float
+    seconds: float
+
+    @property
+    def wrong(self) -> bool:
+        return self.word not in (self.truth, "HOLD")
+
+
+def random_part(blade: NominalBlade, seed: int) -> SimPart:
+    """A part with wear and damages of any size that a plan is about."""
+    rng = np.random.default_rng([seed, 11])
+    worn = worn_blade(blade, random_wear(rng))
+    while True:
+        try:
+            return assemble(
+                blade,
+                worn,
+                random_cuts(worn, rng),
+                preset="random",
+                serial=serial_of(seed, 0),
+                seed=seed,
+                optics=OpticsSettings(noise_normal_mm=rng.uniform(0.005, 0.015)),
+                rng=rng,
+            )
+        except NotASolid:  # a cut that misses the blade: draw again
+            continue
+
+
+def random_wear(rng: np.random.Generator) -> Wear:
+    size = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
+    return Wear(
+        wave_mm=0.005,
+        bump_mm=float(0.06 * size),
+        bend_mm=float(rng.uniform(-0.08, 0.08) * size),
+        untwist_deg=float(rng.uniform(-0.15, 0.15) * size),
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def random_cuts(worn: WornBlade, rng: np.random.Generator) -> list[Cut]:
+    """Each of four kinds of damage with a chance of two in five, in places that do not overlap."""
+    depth = {"tip": (0.6, 18.0), "leading": (0.2, 3.0), "trailing": (0.2, 3.0), "pit": (0.15, 2.5)}
+    chosen = {kind: logarithmic(rng, *sizes) for kind, sizes in depth.items() if rng.random() < 0.4}
+    makers = {
+        "tip": lambda d: tip_corner(worn.airfoil, d, rng.uniform(0.4, 0.8), rng),
+        "leading": lambda d: edge_nick(
+            worn.airfoil, "leading_edge", rng.uniform(0.25, 0.7), d, 3.0 + 3.0 * d, rng
+        ),
+        "trailing": lambda d: edge_nick(
+            worn.airfoil, "trailing_edge", rng.uniform(0.25, 0.6), d, 3.0 + 3.0 * d, rng
+        ),
+        "pit": lambda d: pit(
+            worn.airfoil, rng.uniform(0.25, 0.7), rng.uniform(0.4, 0.6), d, 1.5 + 2.0 * d, rng
+        ),
+    }
+    return [makers[kind](depth_mm) for kind, depth_mm in chosen.items()]
+
+
+def logarithmic(rng: np.random.Generator, least: float, most: float) -> float:
+    return float(np.exp(rng.uniform(np.log(least), np.log(most))))
+
+
+def judged(blade: NominalBlade, seed: int, folder: Path) -> Judged:
+    """The part of a seed, inspected from its files in `folder`."""
+    part = random_part(blade, seed)
+    scan_mm = merged_scan(part, rig_of(blade, seed), VIEWS, seed)
+    write_plan(folder, blade)
+    write_point_ply(folder / "scan.ply", scan_mm)
+    started_s = time.process_time()
+    inspection = inspect_scan(
+        folder / "plan.toml",
+        folder / "scan.ply",
+        folder / "out",
+        serial=part.serial,
+        clock=time.monotonic,
+        progress=lambda step: None,
+    )
+    return Judged(
+        seed=seed,
+        truth=truth_of(part, blade, scan_mm),
+        word=str(inspection.verdict.verdict),
+        reasons=inspection.verdict.reasons,
+        clear=clearance(part),
+        removed_mm3=sum(damage.volume_mm3 for damage in part.damages),
+        seconds=time.process_time() - started_s,
+    )
+
+
+def truth_of(part: SimPart, blade: NominalBlade, scan_mm: Floats) -> str:
+    hidden = largest_gap_mm(part.solid, blade, scan_mm, part.T_table_part) > MAX_GAP_MM
+    return str(part.truth_when(hidden=hidden)["verdict"])
+
+
+def clearance(part: SimPart) -> float:
+    """How near the nearest true value lies to one of its limits, as a share of that limit."""
+    return min(abs(f.value / limit - 1.0) for f in part.judged for limit in (f.serviceable, f.repairable))
+
+
+def show(parts: list[Judged]) -> None:
+    """The table of truths and words, every HOLD's first reason, every wrong word."""
+    counts = Counter((part.truth, part.word) for part in parts)
+    print(f"\n{'truth':8}" + "".join(f"{word:>8}" for word in WORDS))
+    for truth in WORDS:
+        print(f"{truth:8}" + "".join(f"{counts[truth, word]:8d}" for word in WORDS))
+    wrong = [part for part in parts if part.wrong]
+    print(f"{len(wrong)} wrong of {len(parts)}; {np.mean([part.seconds for part in parts]):.1f} CPU s a part")
+
+
+def main() -> int:
+    """How many verdicts were wrong."""
+    parts = int(sys.argv[1]) if len(sys.argv) > 1 else 6
+    first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
+    blade = nominal_blade(None)
+    done = []
+    print(f"{'seed':>5} {'truth':7}{'word':7} {'clear %':>7} {'mm3':>8}  why, where it is not the truth")
+    for seed in range(first, first + parts):
+        with tempfile.TemporaryDirectory() as folder:
+            done.append(judged(blade, seed, Path(folder)))
+        part = done[-1]
+        why = "" if part.word == part.truth else "; ".join(part.reasons[:2])
+        print(
+            f"{seed:5d} {part.truth:7}{part.word:7} {100.0 * part.clear:7.1f} {part.removed_mm3:8.2f}  {why}",
+            flush=True,
+        )
+    show(done)
+    return sum(part.wrong for part in done)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
