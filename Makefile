@@ -6,7 +6,7 @@ DEMO ?= auto
 DEMO_FLAGS := $(if $(filter headless,$(DEMO)),--headless,)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint check bench bench-registration bench-sections bench-twin bench-parts campaign lock picture
+.PHONY: help setup demo test lint check bench bench-registration bench-sections bench-twin bench-parts bench-verdicts campaign lock picture
 
 help:      ## this list
 	@grep -E '^[a-z-]+: .*## ' Makefile | sed -E 's/:.*## /\t/' | expand -t 20
@@ -56,6 +56,9 @@ bench-parts: setup  ## whole parts from views to patches: occlusion, real blades
 	$(BIN)/python -m benchmarks.views
 	$(BIN)/python -m benchmarks.real_parts
 
+bench-verdicts: setup  ## the whole product from files: verdicts of random parts against the truth; none may be wrong
+	$(BIN)/python -m benchmarks.verdicts 20
+
 campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenario, all seeds of the twin
 	$(BIN)/python -m benchmarks.registration --full
 	$(BIN)/python -m benchmarks.poses 1000
@@ -64,6 +67,7 @@ campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenar
 	$(BIN)/python -m benchmarks.repair 10
 	$(BIN)/python -m benchmarks.twin_peers --full
 	$(BIN)/python -m benchmarks.views 5
+	$(BIN)/python -m benchmarks.verdicts 300
 
 picture: setup  ## redraw the picture of the screen in the README
 	$(BIN)/python -m tests.station.tui.picture docs/screen.png
