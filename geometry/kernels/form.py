@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from geometry.kernels.neighbours import insert, margin
+from geometry.kernels.neighbours import choose, insert, margin, room_for
 from geometry.kernels.quadric import cholesky_solve
 from geometry.robust import NORMAL, TUKEY
 from geometry.types import Floats, Ints
@@ -32,7 +32,9 @@ def local_fits(
     count, k = members.shape
     fits = np.empty((count, MOTIONS))
     design, right = np.empty((MOTIONS, MOTIONS)), np.empty(MOTIONS)
-    rows, closeness, weights, residual = np.empty((k, MOTIONS)), np.empty(k), np.empty(k), np.empty(k)
+    rows, weighted = np.empty((k, MOTIONS)), np.empty((k, MOTIONS))
+    right_of, fitted, residual = np.empty(k), np.empty(k), np.empty(k)
+    closeness, weights = np.empty(k), np.empty(k)
     for i in range(count):
         farthest2 = 1e-300
         for j in range(k):
@@ -49,22 +51,18 @@ def local_fits(
             closeness[j] = np.exp(-4.5 * closeness[j] / farthest2)
             weights[j] = closeness[j]
         for _ in range(steps):
-            design[:], right[:] = 0.0, 0.0
             for j in range(k):
-                value = values[members[i, j]]
+                right_of[j] = values[members[i, j]]
                 for a in range(MOTIONS):
-                    weighted = weights[j] * rows[j, a]
-                    right[a] += weighted * value
-                    for b in range(a + 1):
-                        design[a, b] += weighted * rows[j, b]
+                    weighted[j, a] = weights[j] * rows[j, a]
+            np.dot(weighted.T, rows, design)
+            np.dot(weighted.T, right_of, right)
             for a in range(MOTIONS):
                 design[a, a] += ridge * k
             cholesky_solve(design, right)
+            np.dot(rows, right, fitted)
             for j in range(k):
-                fitted = 0.0
-                for a in range(MOTIONS):
-                    fitted += rows[j, a] * right[a]
-                residual[j] = abs(values[members[i, j]] - fitted)
+                residual[j] = abs(right_of[j] - fitted[j])
             scale = TUKEY * max(NORMAL * np.median(residual), 1e-6)
             for j in range(k):
                 weights[j] = closeness[j] * max(1.0 - (residual[j] / scale) ** 2, 0.0) ** 2
@@ -76,6 +74,7 @@ def local_fits(
 def blend(
     points: Floats,
     normals: Floats,
+    visit: Ints,
     nodes: Floats,
     node_normals: Floats,
     fits: Floats,
@@ -87,43 +86,108 @@ def blend(
     cell: float,
     cells: Ints,
 ) -> Floats:
-    """The fits at each point (n,), weighted by closeness over its `nearest` nodes.
+    """The fits at each point of `visit` (n,), weighted by closeness over its `nearest` nodes.
 
     A unit of normal counts as `turn` of distance. `order` and `starts` sort the nodes into a grid of
-    `cells` of edge `cell` from `low`; shells of cells are searched until no nearer node can be outside.
+    `cells` of edge `cell` from `low`. Points of one cell share what lies in the 27 cells around; where a
+    nearer node can be outside, shells of cells are searched until none can. Quickest if `visit` goes cell by
+    cell.
     """
-    values = np.empty(len(points))
+    values = np.empty(len(visit))
     near2, near, row = np.empty(nearest), np.empty(nearest, np.int64), np.empty(MOTIONS)
+    around, places, apart2, ranks = room_for(64)
     grid = (order, starts, low, cell, cells)
-    for i in range(len(points)):
-        _closest_nodes(points[i], normals[i], nodes, node_normals, turn, grid, near, near2)
-        widest = (1.05 * np.sqrt(near2[nearest - 1]) + 1e-9) ** 2
-        total, value = 0.0, 0.0
-        for t in range(nearest):
-            q = near[t]
-            weight = max(1.0 - near2[t] / widest, 0.0) ** 2
-            x, y, z = (
-                points[i, 0] - nodes[q, 0],
-                points[i, 1] - nodes[q, 1],
-                points[i, 2] - nodes[q, 2],
-            )
-            _row(row, x, y, z, normals[i])
-            for a in range(MOTIONS):
-                value += weight * row[a] * fits[q, a]
-            total += weight
-        values[i] = value / total
+    at, last, found = np.empty(3, np.int64), np.full(3, -1), 0
+    for t in range(len(visit)):
+        i = visit[t]
+        _cell_of(points[i], low, cell, cells, at)
+        if at[0] != last[0] or at[1] != last[1] or at[2] != last[2]:
+            last[:] = at
+            found = _count(at, grid)
+            if found > len(around):
+                around, places, apart2, ranks = room_for(2 * found)
+            _gather(at, nodes, node_normals, grid, around, places)
+        _apart2(points[i], normals[i], places, turn, found, apart2)
+        reach = cell + margin(points[i, 0], points[i, 1], points[i, 2], low, cell, at[0], at[1], at[2])
+        if found < nearest or not choose(around, apart2, ranks, found, near, near2) <= reach * reach:
+            _closest_nodes(points[i], normals[i], at, nodes, node_normals, turn, grid, near, near2)
+        values[t] = _blended(points[i], normals[i], nodes, fits, near, near2, row)
     return values
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _cell_of(point, low, cell, cells, at):  # type: ignore[no-untyped-def]
+    for axis in range(3):
+        at[axis] = min(max(int((point[axis] - low[axis]) / cell), 0), cells[axis] - 1)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _row_of(at, r, starts, cells):  # type: ignore[no-untyped-def]
+    """Where row `r` (of nine, three cells each along the last axis) round cell `at` begins and ends."""
+    a, b = at[0] + r // 3 - 1, at[1] + r % 3 - 1
+    if not (0 <= a < cells[0] and 0 <= b < cells[1]):
+        return 0, 0
+    row = (a * cells[1] + b) * cells[2]
+    return starts[row + max(at[2] - 1, 0)], starts[row + min(at[2] + 1, cells[2] - 1) + 1]
+
+
 @njit(cache=True, nogil=True)
-def _closest_nodes(point, normal, nodes, node_normals, turn, grid, near, near2):  # type: ignore[no-untyped-def]
+def _count(at, grid):  # type: ignore[no-untyped-def]
+    """How many nodes the 27 cells round cell `at` hold."""
+    _, starts, _, _, cells = grid
+    found = 0
+    for r in range(9):
+        first, stop = _row_of(at, r, starts, cells)
+        found += stop - first
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _gather(at, nodes, node_normals, grid, around, places):  # type: ignore[no-untyped-def]
+    """Write these nodes, and in columns where they are and their normals."""
+    order, starts, _, _, cells = grid
+    found = 0
+    for r in range(9):
+        first, stop = _row_of(at, r, starts, cells)
+        for j in range(first, stop):
+            q = order[j]
+            around[found] = q
+            for axis in range(3):
+                places[axis, found], places[3 + axis, found] = nodes[q, axis], node_normals[q, axis]
+            found += 1
+
+
+@njit(cache=True, nogil=True)
+def _apart2(point: Floats, normal: Floats, places: Floats, turn: float, found: int, apart2: Floats) -> None:
+    """Squared distances of a point from the first `found` places (6, m), a unit of normal for `turn`."""
+    x, y, z = point[0], point[1], point[2]
+    u, v, w = normal[0], normal[1], normal[2]
+    for j in range(found):
+        a, b, c = x - places[0, j], y - places[1, j], z - places[2, j]
+        d, e, f = turn * (u - places[3, j]), turn * (v - places[4, j]), turn * (w - places[5, j])
+        apart2[j] = a * a + b * b + c * c + d * d + e * e + f * f
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _blended(point, normal, nodes, fits, near, near2, row):  # type: ignore[no-untyped-def]
+    widest = (1.05 * np.sqrt(near2[-1]) + 1e-9) ** 2
+    total, value = 0.0, 0.0
+    for t in range(len(near)):
+        q = near[t]
+        weight = max(1.0 - near2[t] / widest, 0.0) ** 2
+        _row(row, point[0] - nodes[q, 0], point[1] - nodes[q, 1], point[2] - nodes[q, 2], normal)
+        for a in range(MOTIONS):
+            value += weight * row[a] * fits[q, a]
+        total += weight
+    return value / total
+
+
+@njit(cache=True, nogil=True)
+def _closest_nodes(point, normal, at, nodes, node_normals, turn, grid, near, near2):  # type: ignore[no-untyped-def]
     """Fill `near` and `near2` (k,) with the k closest nodes and their squared distances, ascending."""
     order, starts, low, cell, cells = grid
     k = len(near)
     near2[:] = np.inf
-    at = np.empty(3, np.int64)
-    for axis in range(3):
-        at[axis] = min(max(int((point[axis] - low[axis]) / cell), 0), cells[axis] - 1)
     inside = margin(point[0], point[1], point[2], low, cell, at[0], at[1], at[2])
     for shell in range(max(cells[0], cells[1], cells[2]) + 1):
         for a in range(max(0, at[0] - shell), min(cells[0] - 1, at[0] + shell) + 1):

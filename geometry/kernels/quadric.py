@@ -151,15 +151,15 @@ def cholesky_solve(a: Floats, b: Floats) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def plane_heights(points: Floats, nearest: Ints, width: int) -> tuple[Floats, Floats]:
-    """Height (n,) of each point over the plane of its neighbours, and these neighbours' rms about it (n,).
+def plane_heights(points: Floats, nearest: Ints, width: int, first: int, last: int) -> tuple[Floats, Floats]:
+    """Height (m,) of the points from `first` to before `last` over the plane of their neighbours, and these
+    neighbours' rms about it (m,).
 
     The first `width` of `nearest` (n, k) count; the point itself, which is first, takes no part.
     """
-    count = len(nearest)
-    height, scatter = np.empty(count), np.empty(count)
+    height, scatter = np.empty(last - first), np.empty(last - first)
     frame = np.empty((3, 3))
-    for i in range(count):
+    for i in range(first, last):
         near = nearest[i, 1:width]
         mx, my, mz = _tangent_frame(points, near, frame)
         nx, ny, nz = frame[2, 0], frame[2, 1], frame[2, 2]
@@ -167,6 +167,6 @@ def plane_heights(points: Floats, nearest: Ints, width: int) -> tuple[Floats, Fl
         for q in near:
             w = (points[q, 0] - mx) * nx + (points[q, 1] - my) * ny + (points[q, 2] - mz) * nz
             total += w * w
-        scatter[i] = np.sqrt(total / (width - 1))
-        height[i] = (points[i, 0] - mx) * nx + (points[i, 1] - my) * ny + (points[i, 2] - mz) * nz
+        scatter[i - first] = np.sqrt(total / (width - 1))
+        height[i - first] = (points[i, 0] - mx) * nx + (points[i, 1] - my) * ny + (points[i, 2] - mz) * nz
     return height, scatter

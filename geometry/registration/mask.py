@@ -15,6 +15,7 @@ from geometry.types import Bools, Floats, Ints
 
 TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
 BLENDED = 6  # nodes around a point whose local fits are blended there
+CELL = 1.6  # edge of a cell of the nodes, as wide as most of these reach and a little
 IRLS_STEPS = 4
 RIDGE = 1e-3  # flat surfaces do not tell all motions
 REACHES = 6
@@ -100,8 +101,8 @@ def _clear(place: Floats, near: Bools, rim_mm: float) -> Bools:
     """Of the points (n, 6) near the form, those that no point off it is next to."""
     if near.all():
         return near
-    apart, _ = _nearest(place[~near], place, 1)
-    return near & (apart > rim_mm)
+    apart, _ = cKDTree(place[~near]).query(place, distance_upper_bound=np.nextafter(rim_mm, np.inf))
+    return near & ~np.isfinite(apart)
 
 
 def _every_nth(count: int, most: int) -> Ints:
@@ -117,16 +118,19 @@ def _blend(
     points_mm: Floats, normals: Floats, nodes_mm: Floats, node_normals: Floats, fits: Floats
 ) -> Floats:
     """The local fits at each point (n,), weighted by closeness over the nearest nodes."""
-    low_mm, cell_mm = nodes_mm.min(axis=0), _node_pitch(nodes_mm)
+    low_mm, cell_mm = nodes_mm.min(axis=0), CELL * _node_pitch(nodes_mm, node_normals)
     cells = ((nodes_mm.max(axis=0) - low_mm) / cell_mm).astype(np.int64) + 1
     starts, order = counting_sort(cell_index(nodes_mm, low_mm, cell_mm, cells), int(cells.prod()))
-    grid = (order, starts, low_mm, cell_mm, cells)
-    known = (nodes_mm, node_normals, fits, BLENDED, TURN_MM, *grid)
-    values = over_parts(lambda a, b: blend(points_mm[a:b], normals[a:b], *known), len(points_mm))
-    return np.concatenate(values).astype(np.float64, copy=False)
+    _, visit = counting_sort(cell_index(points_mm, low_mm, cell_mm, cells), int(cells.prod()))
+    known = (nodes_mm, node_normals, fits, BLENDED, TURN_MM, order, starts, low_mm, cell_mm, cells)
+    parts = over_parts(lambda a, b: blend(points_mm, normals, visit[a:b], *known), len(points_mm))
+    values = np.empty(len(points_mm))
+    values[visit] = np.concatenate(parts)
+    return values
 
 
-def _node_pitch(nodes_mm: Floats) -> float:
+def _node_pitch(nodes_mm: Floats, normals: Floats) -> float:
     """How far most nodes have enough others to blend, and no less than fills a modest grid."""
-    apart_mm, _ = _nearest(nodes_mm, nodes_mm, BLENDED)
+    place = np.column_stack([nodes_mm, TURN_MM * normals])
+    apart_mm, _ = _nearest(place, place, BLENDED)
     return max(float(np.median(apart_mm[:, -1])), float(np.ptp(nodes_mm, axis=0).max()) / 100.0, 1e-9)

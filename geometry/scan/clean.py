@@ -6,7 +6,8 @@ import numpy as np
 
 from geometry.errors import BadInput
 from geometry.kernels.graph import component_sizes
-from geometry.kernels.neighbours import sorted_nearest
+from geometry.kernels.neighbours import cell_keys, sorted_nearest
+from geometry.kernels.parts import over_parts
 from geometry.kernels.quadric import plane_heights
 from geometry.scan.neighbourhood import Neighboured
 from geometry.types import Bools, Cloud, Floats, Ints
@@ -43,7 +44,9 @@ def clean(cloud: Cloud, settings: CleanSettings = CleanSettings()) -> Cloud:
     """
     if len(cloud) <= 2 * settings.kept_neighbours:
         return cloud
-    order, nearest, distance_mm = sorted_nearest(cloud.points_mm, settings.kept_neighbours + 1)
+    stays = len(cloud) <= settings.most_points
+    wanted = settings.kept_neighbours if stays else settings.neighbours  # thinning would part the others
+    order, nearest, distance_mm = sorted_nearest(cloud.points_mm, wanted + 1)
     cloud = cloud.of(order)
     strays = _strays(nearest, distance_mm, settings)
     return _thin(_without(cloud, strays | _outliers(cloud, nearest, settings), nearest), settings.most_points)
@@ -70,7 +73,9 @@ def _strays(nearest: Ints, distance_mm: Floats, settings: CleanSettings) -> Bool
 
 def _outliers(cloud: Cloud, nearest: Ints, settings: CleanSettings) -> Bools:
     """Points off the plane of neighbours that agree among themselves."""
-    height_mm, scatter_mm = plane_heights(cloud.points_mm, nearest, settings.neighbours + 1)
+    width = settings.neighbours + 1
+    parts = over_parts(lambda a, b: plane_heights(cloud.points_mm, nearest, width, a, b), len(cloud))
+    height_mm, scatter_mm = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
     limit_mm = settings.outlier_sigmas * np.maximum(scatter_mm, cloud.sigma_mm)
     return np.asarray(np.abs(height_mm) > limit_mm)
 
@@ -83,7 +88,7 @@ def _thin(cloud: Cloud, most_points: int) -> Cloud:
     widest_mm = float((high_mm - low_mm).max()) + 1e-9
     finest_mm, cell_mm = widest_mm, widest_mm / np.sqrt(most_points)
     for _ in range(STEPS):
-        count = len(np.unique(_cells(cloud.points_mm, low_mm, cell_mm)))
+        count = int(np.count_nonzero(_firsts(np.sort(cell_keys(cloud.points_mm, low_mm, cell_mm)))))
         if count <= most_points:
             finest_mm = min(finest_mm, cell_mm)
         if FULL * most_points <= count <= most_points:
@@ -92,16 +97,17 @@ def _thin(cloud: Cloud, most_points: int) -> Cloud:
     return cloud.of(_nearest_to_middle(cloud.points_mm, low_mm, finest_mm))
 
 
-def _cells(points_mm: Floats, low_mm: Floats, cell_mm: float) -> Ints:
-    cell = np.floor((points_mm - low_mm) / cell_mm).astype(np.int64)
-    counts = cell.max(axis=0) + 1
-    return np.asarray((cell[:, 0] * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2])
+def _firsts(ascending: Ints) -> Bools:
+    """Where in a sorted array (n,) another value begins."""
+    return np.concatenate([[True], np.diff(ascending) != 0])
 
 
 def _nearest_to_middle(points_mm: Floats, low_mm: Floats, cell_mm: float) -> Ints:
-    key = _cells(points_mm, low_mm, cell_mm)
-    within = (points_mm - low_mm) / cell_mm
+    keys = cell_keys(points_mm, low_mm, cell_mm)
+    order = np.argsort(keys, kind="stable")
+    within = (points_mm[order] - low_mm) / cell_mm
     off = np.linalg.norm(within - np.floor(within) - 0.5, axis=1)
-    order = np.lexsort([off, key])
-    first = np.concatenate([[True], np.diff(key[order]) != 0])
-    return np.sort(order[first])
+    firsts = _firsts(keys[order])
+    cell = np.cumsum(firsts) - 1
+    least = np.flatnonzero(off == np.minimum.reduceat(off, np.flatnonzero(firsts))[cell])
+    return np.sort(order[least[_firsts(cell[least])]])

@@ -56,7 +56,11 @@ def test_the_blend_matches_a_tree_wherever_a_point_lies():
     low, cell = nodes.min(axis=0), 4.0
     cells = ((nodes.max(axis=0) - low) / cell).astype(np.int64) + 1
     starts, order = counting_sort(cell_index(nodes, low, cell, cells), int(cells.prod()))
-    fast = blend(points, normals, nodes, node_normals, fits, 6, 10.0, order, starts, low, cell, cells)
+    visit = rng.permutation(300)
+    fast = np.empty(300)
+    fast[visit] = blend(
+        points, normals, visit, nodes, node_normals, fits, 6, 10.0, order, starts, low, cell, cells
+    )
     tree = cKDTree(np.column_stack([nodes, 10.0 * node_normals]))
     apart, near = tree.query(np.column_stack([points, 10.0 * normals]), 6)
     weights = np.maximum(1.0 - (apart / (1.05 * apart[:, -1:] + 1e-9)) ** 2, 0.0) ** 2

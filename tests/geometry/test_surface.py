@@ -77,7 +77,7 @@ def test_height_over_the_neighbours_plane_leaves_the_point_out():
     points = np.column_stack([rng.uniform(-1, 1, (400, 2)), rng.normal(scale=0.01, size=400)])
     points[7, 2] = 0.5
     nearest, _ = k_nearest(points, 17)
-    height, scatter = plane_heights(points, nearest, 13)
+    height, scatter = plane_heights(points, nearest, 13, 0, 400)
     for i in (7, 50, 222):
         near = points[nearest[i, 1:13]]
         normal = np.linalg.svd(near - near.mean(axis=0))[2][2]
