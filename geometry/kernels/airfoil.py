@@ -27,19 +27,30 @@ def inscribed_circles(points_mm: Floats, normals: Floats, at: Ints, against: Int
 
     `normals` (m, 2) point outward. Only nodes of `against` bound the circles: the other side of the
     airfoil, so that ripples beside the contact do not shrink them. Radius inf where nothing bounds it.
+    What is farther from the contact than a circle is wide cannot bound it, nor can as many nodes after it as
+    do not come that near.
     """
     radius = np.full(len(at), np.inf)
     contact = np.zeros(len(at), np.int64)
+    step = 1e-300  # the longest between neighbours of `against`
+    for k in range(1, len(against)):
+        j, i = against[k], against[k - 1]
+        dx, dy = points_mm[j, 0] - points_mm[i, 0], points_mm[j, 1] - points_mm[i, 1]
+        step = max(step, math.sqrt(dx * dx + dy * dy))
+    last = 0
     for n in range(len(at)):
         i = at[n]
-        for j in against:
-            dx = points_mm[j, 0] - points_mm[i, 0]
-            dy = points_mm[j, 1] - points_mm[i, 1]
+        k = -1 if len(against) > 0 else 0  # first the contact of the circle before, which bounds well
+        while k < len(against):
+            j = against[k if k >= 0 else last]
+            dx, dy = points_mm[j, 0] - points_mm[i, 0], points_mm[j, 1] - points_mm[i, 1]
             depth = -(dx * normals[i, 0] + dy * normals[i, 1])
-            if depth > 0.0:
-                r = (dx * dx + dy * dy) / (2.0 * depth)
-                if r < radius[n]:
-                    radius[n], contact[n] = r, j
+            d2 = dx * dx + dy * dy
+            if depth > 0.0 and d2 < 2.0 * depth * radius[n]:
+                radius[n], contact[n] = d2 / (2.0 * depth), j
+                last = k if k >= 0 else last
+            beyond = math.sqrt(d2) - 2.0 * radius[n] if k >= 0 else 0.0
+            k += 1 + int(max(0.0, beyond / step - 1e-6))
     return radius, contact
 
 

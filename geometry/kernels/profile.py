@@ -16,45 +16,74 @@ def wrap(j: int, m: int) -> int:
     return j + m if j < 0 else j
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _node(curves: Floats, three: int, up: float, j: int) -> tuple[float, float]:
-    """Node `j` of the curve at the fraction `up` of the interval `three`: a parabola in height."""
-    x = curves[three, j, 0] + up * (curves[three, j, 2] + up * curves[three, j, 4])
-    y = curves[three, j, 1] + up * (curves[three, j, 3] + up * curves[three, j, 5])
+    """Node `j` of the curve at the fraction `up` of the interval `three`: a parabola in height.
+
+    Unsigned numbers, so that none is tested for counting from the end.
+    """
+    t, n = np.uint64(three), np.uint64(j)
+    x = curves[t, n, 0] + up * (curves[t, n, 2] + up * curves[t, n, 4])
+    y = curves[t, n, 1] + up * (curves[t, n, 3] + up * curves[t, n, 5])
     return x, y
 
 
 @njit(cache=True, nogil=True)
-def _descend(curves: Floats, three: int, up: float, x: float, y: float, start: int) -> tuple[int, float]:
-    """The locally nearest node, by a jump along the tangent at `start` and then step by step; distance^2."""
+def _search(curves: Floats, three: int, up: float, x: float, y: float, starts: tuple[int, int]) -> int:
+    """The nearest of the nodes that are reached step by step from two starts, the second perhaps -1."""
+    m = curves.shape[1]
+    nearest, least = 0, math.inf
+    for start in starts:
+        if start < 0:
+            continue
+        j = start
+        nx, ny = _node(curves, three, up, j)
+        best = (nx - x) ** 2 + (ny - y) ** 2
+        stride = 4
+        while stride >= 1:
+            for direction in (stride, -stride):
+                while True:
+                    k = wrap(j + direction, m)
+                    nx, ny = _node(curves, three, up, k)
+                    d2 = (nx - x) ** 2 + (ny - y) ** 2
+                    if d2 >= best:
+                        break
+                    j, best = k, d2
+            stride //= 4
+        if best < least:
+            nearest, least = j, best
+    return nearest
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _slide(curves: Floats, three: int, up: float, x: float, y: float, start: int) -> tuple[int, float]:
+    """The locally nearest node, or the one before it, by jumps along the tangent; distance^2.
+
+    That is inf where they do not settle, as about an edge seen from inside.
+    """
     m = curves.shape[1]
     j = start
-    nx, ny = _node(curves, three, up, j)
-    best = (nx - x) ** 2 + (ny - y) ** 2
-    px, py = _node(curves, three, up, wrap(j + 1, m))
-    ex, ey = px - nx, py - ny
-    jump = round(((x - nx) * ex + (y - ny) * ey) / (ex * ex + ey * ey + 1e-300))
-    if jump != 0:
-        k = wrap(j + min(max(jump, -40), 40), m)
-        nx, ny = _node(curves, three, up, k)
-        d2 = (nx - x) ** 2 + (ny - y) ** 2
-        if d2 < best:
-            j, best = k, d2
-    stride = 4
-    while stride >= 1:
-        for direction in (stride, -stride):
-            while True:
-                k = wrap(j + direction, m)
-                nx, ny = _node(curves, three, up, k)
-                d2 = (nx - x) ** 2 + (ny - y) ** 2
-                if d2 >= best:
-                    break
-                j, best = k, d2
-        stride //= 4
-    return j, best
+    for _ in range(4):
+        nx, ny = _node(curves, three, up, j)
+        px, py = _node(curves, three, up, wrap(j + 1, m))
+        ex, ey = px - nx, py - ny
+        along = ((x - nx) * ex + (y - ny) * ey) / (ex * ex + ey * ey + 1e-300)
+        if -0.5 <= along <= 1.0:
+            return j, (nx - x) ** 2 + (ny - y) ** 2
+        j = wrap(j + math.floor(min(max(along, -40.0), 40.0) + 0.5), m)
+    return j, math.inf
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
+def _on_segment(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> tuple[float, float]:
+    """The nearest place on a segment, as a fraction of it, and the distance^2 to there."""
+    ex, ey = bx - ax, by - ay
+    f = ((x - ax) * ex + (y - ay) * ey) / (ex * ex + ey * ey + 1e-300)
+    f = min(1.0, max(0.0, f))
+    return f, (x - ax - f * ex) ** 2 + (y - ay - f * ey) ** 2
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _foot(
     curves: Floats, three: int, up: float, x: float, y: float, j: int
 ) -> tuple[float, float, float, float]:
@@ -63,24 +92,19 @@ def _foot(
     cx, cy = _node(curves, three, up, j)
     lx, ly = _node(curves, three, up, wrap(j - 1, m))
     rx, ry = _node(curves, three, up, wrap(j + 1, m))
-    best = math.inf
-    foot = 0.0
-    fx = fy = nx = ny = 0.0
-    for side in (-1, 0):
-        ax, ay = (lx, ly) if side < 0 else (cx, cy)
-        bx, by = (cx, cy) if side < 0 else (rx, ry)
-        ex, ey = bx - ax, by - ay
-        length2 = ex * ex + ey * ey + 1e-300
-        f = min(1.0, max(0.0, ((x - ax) * ex + (y - ay) * ey) / length2))
-        qx, qy = ax + f * ex, ay + f * ey
-        d2 = (x - qx) ** 2 + (y - qy) ** 2
-        length = math.sqrt(length2)
-        if d2 < best:
-            best, foot, fx, fy = d2, j + side + f, qx, qy
-            nx, ny = ey / length, -ex / length
-    if fx == cx and fy == cy:  # on the node itself: the mean normal decides inside and outside
-        length = math.hypot(rx - lx, ry - ly) + 1e-300
-        nx, ny = (ry - ly) / length, (lx - rx) / length
+    before, low2 = _on_segment(lx, ly, cx, cy, x, y)
+    after, high2 = _on_segment(cx, cy, rx, ry, x, y)
+    if low2 < high2:
+        f, best, foot = before, low2, j - 1 + before
+        ax, ay, ex, ey = lx, ly, cx - lx, cy - ly
+    else:
+        f, best, foot = after, high2, j + after
+        ax, ay, ex, ey = cx, cy, rx - cx, ry - cy
+    fx, fy = ax + f * ex, ay + f * ey
+    if foot == j:  # on the node itself: the mean normal decides inside and outside
+        ex, ey = rx - lx, ry - ly
+    length = math.sqrt(ex * ex + ey * ey) + 1e-300
+    nx, ny = ey / length, -ex / length
     distance = math.sqrt(best)
     if (x - fx) * nx + (y - fy) * ny < 0.0:
         distance = -distance
@@ -111,11 +135,10 @@ def _nearest(
     """The nearest node of the curve at the fraction `up` of the interval `three`."""
     cx = min(max(int((x - corner_mm[0]) / cell_mm), 0), seeds.shape[0] - 1)
     cy = min(max(int((y - corner_mm[1]) / cell_mm), 0), seeds.shape[1] - 1)
-    j, best = _descend(curves, three, up, x, y, seeds[cx, cy, 0])
-    if seeds[cx, cy, 1] >= 0 and 16.0 * best > across_mm[j] ** 2:
-        k, other = _descend(curves, three, up, x, y, seeds[cx, cy, 1])
-        if other < best:
-            j = k
+    j, best = _slide(curves, three, up, x, y, seeds[cx, cy, 0])
+    other = seeds[cx, cy, 1]
+    if best == math.inf or (other >= 0 and 16.0 * best > across_mm[j] ** 2):
+        j = _search(curves, three, up, x, y, (j, other))
     return j
 
 
@@ -131,8 +154,9 @@ def project(
 ) -> Floats:
     """(n, 4) of every point: node coordinate in [0, m), signed in-plane distance, outward normal x, y.
 
-    `curves` (k, m, 6) are counter-clockwise curves whose nodes correspond, one for each interval of height
-    between the even ones of `z_mm` (2 k + 1,): x, y, their slope and their bend over the interval.
+    `curves` (k, m, 8) are counter-clockwise curves whose nodes correspond, one for each interval of height
+    between the even ones of `z_mm` (2 k + 1,): x, y, their slope and their bend over the interval, and
+    steepness (mm outward per mm of height) with its slope, NaN where the curve is not to be trusted.
     `seeds` (nx, ny, 2) name for each cell a start node and, where the other side of the airfoil may be as
     near, one there, else -1. `across_mm` (m,): how far the other side is from each node; it is not looked
     at for a point within a quarter of that.
@@ -166,26 +190,6 @@ def nearest_nodes(points_mm: Floats, curve_mm: Floats) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def _steep(j: int, three: int, up: float, growth: Floats, trusted: Bools) -> float:
-    """Outward growth of the surface with height about node `j`; NaN where its parabola is not trusted."""
-    near = 2 * three + (0 if up < 0.25 else (1 if up < 0.75 else 2))
-    return growth[near, j] if trusted[three, j] else math.nan
-
-
-@njit(cache=True, nogil=True)
-def steepness(node: Floats, z: Floats, z_mm: Floats, growth: Floats, trusted: Bools) -> Floats:
-    """Outward growth (n,) of a surface with height at the nearest curve of `project`; NaN where not trusted.
-
-    `growth` (2 k + 1, m) at the nodes, `trusted` (k, m) for each parabola.
-    """
-    out = np.empty(len(node))
-    for i in range(len(node)):
-        three, up = _interval(z_mm, z[i])
-        out[i] = _steep(int(node[i]), three, up, growth, trusted)
-    return out
-
-
-@njit(cache=True, nogil=True)
 def _undone(
     x: float, y: float, height: float, pivot_mm: Floats, rest: Floats, per_mm: Floats
 ) -> tuple[float, float]:
@@ -211,42 +215,42 @@ def undo_motion(points_mm: Floats, pivot_mm: Floats, z_mm: float, rest: Floats, 
 @njit(cache=True, nogil=True)
 def lay(
     points_mm: Floats,
+    sigma_mm: Floats,
     motion: tuple[Floats, float, Floats, Floats],
-    surface: tuple[Floats, Floats, Floats, Bools],
-    grid: tuple[Ints, Floats, Floats, float],
+    surface: tuple[Floats, Floats, Ints, Floats, Floats, float],
     limits: tuple[float, float],
-) -> tuple[Ints, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """The points that belong to a profile, as what `band_misfit` takes of them.
 
-    `motion` as `undo_motion` takes it, `surface` (`z_mm`, `curves`, `growth`, `trusted`) and `grid` (`seeds`,
-    `across_mm`, `corner_mm`, `cell_mm`) as `project` and `steepness` do. Points belong that lie within
-    `limits` of the curve, where it is no steeper. Returns their numbers (k,), (k, 3) node coordinate,
-    height, and how much longer a distance in the plane is than along the surface normal, and (k, 6)
-    signed distance, arm x, y, outward normal x, y and height over the section.
+    `motion` as `undo_motion` takes it, `surface` (`z_mm`, `curves`, `seeds`, `across_mm`, `corner_mm`,
+    `cell_mm`) as `project` does. Points belong that lie within `limits` of the curve, where it is no
+    steeper. Returns their node coordinate, height and sigma (k,), grown as a distance in the plane is
+    longer than along the surface normal, and (k, 6) signed distance, arm x, y, outward normal x, y and
+    height over the section.
     """
     pivot_mm, section_mm, rest, per_mm = motion
-    z_mm, curves, growth, trusted = surface
-    seeds, across_mm, corner_mm, cell_mm = grid
+    z_mm, curves, seeds, across_mm, corner_mm, cell_mm = surface
     capture_mm, steepest = limits
-    number, place = np.empty(len(points_mm), np.int64), np.empty((len(points_mm), 3))
-    rows = np.empty((len(points_mm), 6))
+    count = len(points_mm)
+    node, heights_mm, sigmas_mm = np.empty(count), np.empty(count), np.empty(count)
+    rows = np.empty((count, 6))
     used = 0
-    for i in range(len(points_mm)):
+    for i in range(count):
         z = points_mm[i, 2]
         height = z - section_mm
         x, y = _undone(points_mm[i, 0], points_mm[i, 1], height, pivot_mm, rest, per_mm)
         three, up = _interval(z_mm, z)
         j = _nearest(curves, three, up, x, y, seeds, across_mm, corner_mm, cell_mm)
         foot, distance, nx, ny = _foot(curves, three, up, x, y, j)
-        steep = _steep(int(foot), three, up, growth, trusted)
+        steep = curves[three, int(foot), 6] + up * curves[three, int(foot), 7]
         if abs(distance) <= capture_mm and abs(steep) <= steepest:
-            number[used] = i
-            place[used, 0], place[used, 1], place[used, 2] = foot, z, math.sqrt(1.0 + steep * steep)
+            node[used], heights_mm[used] = foot, z
+            sigmas_mm[used] = sigma_mm[i] * math.sqrt(1.0 + steep * steep)
             rows[used, 0], rows[used, 3], rows[used, 4] = distance, nx, ny
             rows[used, 1], rows[used, 2] = x - pivot_mm[0], y - pivot_mm[1]
             rows[used, 5] = height
             used += 1
-    return number[:used], place[:used], rows[:used]
+    return node[:used], heights_mm[:used], sigmas_mm[:used], rows[:used]
 
 
 @njit(cache=True, nogil=True)

@@ -206,9 +206,9 @@ class SplineFit:
         for k in range(4):
             for d in range(4 - k):
                 own += _TWICE[d] * along[:, k] * along[:, k + d] * inside[row[:, k], d]
-        bent = self.layout.unfold(self.solved).transpose(0, 2, 1) @ across
-        rest = self._padded(free) - (bent[row] * along[:, :, None]).sum(axis=1).T
-        variances: Floats = self.scale * (own + (rest * np.linalg.solve(self.schur, rest)).sum(axis=0))
+        bent = across @ self.layout.unfold(self.solved)
+        rest = self._padded(free).T - sum(along[:, k, None] * bent[row[:, k]] for k in range(4))
+        variances: Floats = self.scale * (own + ((rest @ np.linalg.inv(self.schur)) * rest).sum(axis=1))
         return variances
 
     def _padded(self, free: Floats) -> Floats:

@@ -18,6 +18,31 @@ def _cubic(f: float, b: Floats) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _add_span(
+    i0: int, k0: int, pairs: Floats, terms: Floats, gram: Floats, right: Floats, cross: Floats
+) -> None:
+    """Adds what the data of one knot span gave (see `tensor_sums`), and clears it."""
+    p = len(right)
+    one = 0
+    for a in range(4):
+        i = wrap(i0 + a, p)
+        for d in range(4 - a):
+            other = 0
+            for k in range(4):
+                for m in range(k, 4):
+                    gram[i, d, k0 + k, k0 + m] += pairs[one, other]
+                    if m > k:
+                        gram[i, d, k0 + m, k0 + k] += pairs[one, other]
+                    other += 1
+            one += 1
+        for k in range(4):
+            right[i, k0 + k] += terms[4 * a + k, 0]
+            cross[i, k0 + k] += terms[4 * a + k, 1:]
+    pairs[:] = 0.0
+    terms[:] = 0.0
+
+
+@njit(cache=True, nogil=True)
 def tensor_sums(
     u: Floats, v: Floats, y: Floats, weight: Floats, extra: Floats, shape: tuple[int, int]
 ) -> tuple[Floats, Floats, Floats]:
@@ -26,34 +51,42 @@ def tensor_sums(
     `u` in knot spans of the periodic direction, `v` in knot spans from the first one of the open one,
     `shape` the numbers of coefficients (p, q). Gives `gram` (p, 4, q, q): sum of the products of the
     coefficients (i, k) and (i + d, l); `right` (p, q): against `y`; `cross` (p, q, e): against `extra`.
+    Data that follow one another in a knot span are summed before they are added to these.
     """
     p, q = shape
     e = extra.shape[1]
-    gram = np.zeros((p, 4, q, q))
-    right = np.zeros((p, q))
-    cross = np.zeros((p, q, e))
-    bu = np.empty(4)
-    bv = np.empty(4)
+    gram, right, cross = np.zeros((p, 4, q, q)), np.zeros((p, q)), np.zeros((p, q, e))
+    bu, bv, both = np.empty(4), np.empty(4), np.empty(10)
+    pairs, terms = np.zeros((10, 10)), np.zeros((16, e + 1))  # of two splines each way; of one and a column
+    i, j = 0, 0
     for n in range(len(u)):
         if weight[n] == 0.0:
             continue
-        i0 = int(u[n])
-        k0 = min(max(int(v[n]), 0), q - 4)
+        i0, k0 = int(u[n]), min(max(int(v[n]), 0), q - 4)
+        if i0 != i or k0 != j:
+            _add_span(i, j, pairs, terms, gram, right, cross)
+            i, j = i0, k0
         _cubic(u[n] - i0, bu)
         _cubic(v[n] - k0, bv)
+        other = 0
+        for k in range(4):
+            for m in range(k, 4):
+                both[other] = bv[k] * bv[m]
+                other += 1
+        one = 0
         for a in range(4):
-            i = wrap(i0 + a, p)
             wa = weight[n] * bu[a]
+            for b in range(a, 4):
+                wab = wa * bu[b]
+                for c in range(10):
+                    pairs[one, c] += wab * both[c]
+                one += 1
             for k in range(4):
                 wak = wa * bv[k]
-                right[i, k0 + k] += wak * y[n]
+                terms[4 * a + k, 0] += wak * y[n]
                 for c in range(e):
-                    cross[i, k0 + k, c] += wak * extra[n, c]
-            for d in range(4 - a):
-                wad = wa * bu[a + d]
-                for k in range(4):
-                    for m in range(4):
-                        gram[i, d, k0 + k, k0 + m] += wad * bv[k] * bv[m]
+                    terms[4 * a + k, c + 1] += wak * extra[n, c]
+    _add_span(i, j, pairs, terms, gram, right, cross)
     return gram, right, cross
 
 

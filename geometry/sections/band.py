@@ -31,7 +31,7 @@ _BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # of what is told from outliers:
 _START = np.array([5e4, 5e4, 1e8])  # of the search for the strengths: those of a blade in service
 _RIGID_PRIOR = np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0  # weak: `find_motion` has taken most
 _PILOT_BINS = (2, 4)  # ... in each knot span along the arc, and across
-_BINS = (4, 8)  # the same for all points
+_BINS = (4, 4)  # the same for all points
 _LIKELIER = 9.0  # twice the gain in log likelihood
 _ARM_MM = 10.0  # a turn counts as the movement of a point so far from the centroid
 
@@ -112,8 +112,9 @@ class Band:
     sigma_mm: Floats
     rows: Floats  # (n, 6) signed distance, arm x, y, outward normal x, y, height in half widths of the band
 
-    def every(self, step: int) -> "Band":
-        """Every so many of the points."""
+    def few(self) -> "Band":
+        """A share of the points, evenly through them."""
+        step = max(1, len(self.node) // _PILOT_POINTS)
         return Band(
             node=self.node[::step],
             z_mm=self.z_mm[::step],
@@ -137,7 +138,7 @@ class LaidBand:
     def sums(self, keep: Bools, penalty: Penalty, bins_a_span: tuple[int, int]) -> Sums:
         """Weighted sums of some points: the means of small bins stand for the points in them."""
         rows, knots = self.band.rows, self.knots
-        weight = np.where(keep, self.band.sigma_mm**-2.0, 0.0)
+        weight = keep / np.square(self.band.sigma_mm)
         bins = band_bins(self.u, self.v, rows, weight, (knots.p, knots.q - 3), bins_a_span)
         sums = gather(bins[:, 0], bins[:, 1], bins[:, 3], bins[:, 2], bins[:, 4:], penalty.layout)
         return replace(
@@ -178,10 +179,10 @@ def onto_chart(
 
     On a slanted surface the distance in the plane is longer than along the normal, and so is its sigma.
     """
-    number, place, rows = chart.lay(points_mm, motion, settings.capture_mm, settings.steepest)
+    limits = settings.capture_mm, settings.steepest
+    node, z_mm, sigma_mm, rows = chart.lay(points_mm, sigma_mm, motion, limits)
     rows[:, 5] /= settings.band_mm
-    node, z_mm, longer = place.T
-    return Band(node=node, z_mm=z_mm, sigma_mm=sigma_mm[number] * longer, rows=rows)
+    return Band(node=node, z_mm=z_mm, sigma_mm=sigma_mm, rows=rows)
 
 
 def robust_fit(
@@ -194,7 +195,7 @@ def robust_fit(
     knots = place_knots(chart, span_mm, settings)
     penalty = _penalty(chart, knots, settings)
     laid = band.laid(knots)
-    few = band.every(max(1, len(band.node) // _PILOT_POINTS)).laid(knots)
+    few = band.few().laid(knots)
     keep = np.ones(len(few.u), bool)
     for limit in (2.0 * settings.outlier, settings.outlier):
         pilot = eliminate(few.sums(keep, penalty, _PILOT_BINS), penalty, _BENDING_PER_MM**-2.0)

@@ -56,10 +56,10 @@ def max_camber(curve_mm: Floats, camber: CamberLine, line: Line) -> Estimate:
     weight = np.ones(len(place))
     for _ in range(8):
         weighted = basis.T * (share * weight)
-        pull = np.linalg.solve(weighted @ basis, weighted)
-        off = height - basis @ (pull @ height)
+        off = height - basis @ np.linalg.solve(weighted @ basis, weighted @ height)
         scale = spread(off) + _OFF * (high - low)
         weight = biweight(off, TUKEY * scale)
+    pull = np.linalg.solve(weighted @ basis, weighted)
     fine = np.linspace(low, high, 2001)
     heights = BSpline(knots, pull @ height, 3)(fine)
     top = int(np.argmax(np.abs(heights)))

@@ -20,6 +20,7 @@ from geometry.robust import TUKEY, biweight, spread
 from geometry.types import Bools, Floats, Ints
 
 NODES = 2048  # of a profile; half on each side between the edges
+MOTION_POINTS = 2000  # tell a section's motion as well as all do
 
 
 Freedom = Literal["x", "y", "rotation"]
@@ -105,9 +106,7 @@ class Chart:
 
     z_mm: Floats  # (2 k + 1,), ascending
     nodes_mm: Floats  # (2 k + 1, NODES, 2)
-    trusted: Bools  # (k, NODES) the parabola holds: not so in a tip's rounding
-    curves: Floats  # (k, NODES, 6) these parabolas, as `project` takes them
-    growth_of_nodes: Floats  # (2 k + 1, NODES) mm outward per mm of height
+    curves: Floats  # (k, NODES, 8) these parabolas and how steep they are, as `project` takes them
     here: int  # the layer of the section itself
     arc_mm: Floats  # (NODES + 1,) along the section itself, closed
     side: Ints  # (NODES,) as in `NominalSection`: 0 leading edge, 1 suction, 2 trailing edge, 3 pressure
@@ -141,16 +140,12 @@ class Chart:
         return growth
 
     def lay(
-        self, points_mm: Floats, motion: "Motion", capture_mm: float, steepest: float
-    ) -> tuple[Ints, Floats, Floats]:
+        self, points_mm: Floats, sigma_mm: Floats, motion: "Motion", limits: tuple[float, float]
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """What of the points (n, 3), their motion undone, is near and upright enough: see the kernel."""
-        return lay(
-            np.ascontiguousarray(points_mm),
-            (motion.pivot_mm, motion.z_mm, motion.rest, motion.per_mm),
-            (self.z_mm, self.curves, self.growth_of_nodes, self.trusted),
-            (self.seeds, self.across_mm, self.corner_mm, self.cell_mm),
-            (capture_mm, steepest),
-        )
+        moved = motion.pivot_mm, motion.z_mm, motion.rest, motion.per_mm
+        surface = self.z_mm, self.curves, self.seeds, self.across_mm, self.corner_mm, self.cell_mm
+        return lay(np.ascontiguousarray(points_mm), sigma_mm, moved, surface, limits)
 
     def arc_at(self, node: Floats) -> Floats:
         """Arc length on the section of node coordinates."""
@@ -178,15 +173,14 @@ def unroll(nominal: Nominal, z_mm: float, reach_mm: float, settings: SectionSett
     ]
     heights = [float(low), *(height for three in threes for height in three.above_mm)]
     nodes = np.stack([nodes_at(height) for height in heights])
+    trusted = np.stack([three.wrong_mm <= settings.blend_limit_mm for three in threes])
     here = heights.index(z_mm)
     seeds, across, corner, cell = _seeds(nodes, here)
     arc = np.concatenate([[0.0], np.cumsum(_lengths(nodes[here]))])
     return Chart(
         z_mm=np.array(heights),
         nodes_mm=nodes,
-        trusted=np.stack([three.wrong_mm <= settings.blend_limit_mm for three in threes]),
-        curves=_parabolas(nodes),
-        growth_of_nodes=_growth(np.array(heights), nodes),
+        curves=_curves(np.array(heights), nodes, trusted),
         here=here,
         arc_mm=arc,
         side=_sides(nominal.section(z_mm), nodes[here]),
@@ -208,19 +202,16 @@ def outward_normal(curve_mm: Floats, node: int) -> Floats:
     return np.array([y, -x]) / np.hypot(x, y)
 
 
-def _parabolas(nodes_mm: Floats) -> Floats:
-    """The parabola in height of every node over each three sections: place, slope and bend, (k, NODES, 6)."""
+def _curves(z_mm: Floats, nodes_mm: Floats, trusted: Bools) -> Floats:
+    """What `project` takes: the parabola in height of every node over each three sections (place, slope and
+    bend), and between the outer two how far it moves outward with height, where that is `trusted`."""
     low, middle, high = nodes_mm[:-1:2], nodes_mm[1::2], nodes_mm[2::2]
-    return np.ascontiguousarray(
-        np.concatenate([low, 4.0 * middle - 3.0 * low - high, 2.0 * (low + high) - 4.0 * middle], axis=2)
-    )
-
-
-def _growth(z_mm: Floats, nodes_mm: Floats) -> Floats:
-    """How far every node moves along its normal with height, (2 k + 1, NODES)."""
     normals = np.stack([outward_normals(curve) for curve in nodes_mm])
-    growth: Floats = (np.gradient(nodes_mm, z_mm, axis=0) * normals).sum(axis=2)
-    return growth
+    growth = (np.gradient(nodes_mm, z_mm, axis=0) * normals).sum(axis=2)
+    steep = np.stack([growth[:-1:2], growth[2::2] - growth[:-1:2]], axis=2)
+    steep[~trusted] = np.nan
+    slope, bend = 4.0 * middle - 3.0 * low - high, 2.0 * (low + high) - 4.0 * middle
+    return np.ascontiguousarray(np.concatenate([low, slope, bend, steep], axis=2))
 
 
 def curvature(curve_mm: Floats) -> Floats:
@@ -361,7 +352,7 @@ def find_motion(chart: Chart, points_mm: Floats) -> Motion:
     pivot, z_mm = chart.curve_mm.mean(axis=0), chart.section_z_mm
     prior = np.array([1.0, 1.0, 0.02, 0.1, 0.1, 0.002]) ** -2.0
     total = np.zeros(6)
-    some = points_mm[:: max(1, len(points_mm) // 2000)]
+    some = points_mm[:: max(1, len(points_mm) // MOTION_POINTS)]
     for _ in range(6):
         motion = Motion(pivot_mm=pivot, z_mm=z_mm, rest=total[:3], per_mm=total[3:])
         back = motion.undo(some)

@@ -138,13 +138,13 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
         raise CannotMeasure(f"no sound points within {settings.band_mm:g} mm of the plane")
     sound = scan.points_mm.take(inside, axis=0)
     motion = find_motion(chart, sound)
-    band = onto_chart(sound, scan.sigma_mm[inside], chart, motion, settings)
+    band = onto_chart(sound, scan.sigma_mm.take(inside), chart, motion, settings)
     if len(band.node) < settings.min_points:
         raise CannotMeasure("no sound points near the nominal section")
     keep, knots, fit = robust_fit(band, chart, (low, high), settings)
     close = np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0
     arc = _supporting(chart.arc_at(band.node[close]), keep[close], settings.max_gap_mm)
-    profile = _profile(chart, motion, knots, fit, float(np.median(band.sigma_mm)))
+    profile = _profile(chart, motion, knots, fit, float(np.median(band.few().sigma_mm)))
     widest = _widest(chart.perimeter_mm, len(arc), settings)
     used = band.z_mm[keep]
     return replace(
@@ -198,11 +198,11 @@ def _supporting(arc_mm: Floats, keep: Bools, width_mm: float) -> Floats:
 
     Where the profile passes most points by, those that it meets by chance do not support it.
     """
-    every, kept = np.sort(arc_mm), np.sort(arc_mm[keep])
-    half = np.array([[-0.5], [0.5]]) * width_mm
-    total = np.diff(np.searchsorted(every, kept + half), axis=0)[0]
-    good = np.diff(np.searchsorted(kept, kept + half), axis=0)[0]
-    return kept[2 * good >= total]
+    order = np.argsort(arc_mm)
+    arc, kept = arc_mm[order], keep[order]
+    supported = np.concatenate([[0], np.cumsum(kept)])
+    first, last = (np.searchsorted(arc, arc[kept] + half) for half in (-0.5 * width_mm, 0.5 * width_mm))
+    return arc[kept][2 * (supported[last] - supported[first]) >= last - first]
 
 
 def whole_gap(chart: Chart) -> tuple[Gap, ...]:

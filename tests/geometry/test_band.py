@@ -1,14 +1,16 @@
 """The band's kernels against slow twins, held functions against dense conditioning, and the width chosen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from geometry.kernels.profile import nearest_nodes, sort_by_height, steepness
+from geometry.kernels.profile import nearest_nodes, sort_by_height
 from geometry.kernels.profile_spline import curvature_penalty, gather, solve, stencil
 from geometry.kernels.tensor_spline import band_bins, band_misfit, tensor_values
 from geometry.sections.band import band_of
-from geometry.sections.chart import Motion, SectionSettings, curvature, rigid_columns, unroll
+from geometry.sections.chart import Motion, SectionSettings, curvature, outward_normals, rigid_columns, unroll
 from geometry.sections.curve import centroid
 from geometry.sections.profile import Scan, reconstruct
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part
@@ -65,12 +67,24 @@ def test_nearest_nodes_equal_the_search_over_all():
     assert_allclose(np.linalg.norm(moved - curve[found], axis=1), expected, atol=2e-3)
 
 
-def test_steepness_is_that_of_the_nearest_of_the_three_sections():
-    z_mm = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
-    growth = np.arange(10.0).reshape(5, 2)
-    trusted = np.array([[True, True], [True, False]])
-    found = steepness(np.array([0.3, 1.9, 0.0, 1.0]), np.array([0.1, 1.2, 3.9, 3.0]), z_mm, growth, trusted)
-    assert_allclose(found, [0.0, 3.0, 8.0, np.nan])
+def test_steepness_is_the_outward_growth_with_height():
+    """A blade that grows by a hundredth of its size every mm, and moves along x as it does."""
+    blade = Blade(twist_deg=0.0, taper=-1.05)
+    chart = unroll(AnalyticNominal(blade), 52.5, 12.0, SETTINGS)
+    nodes = np.arange(0, 2048, 13)
+    expected = 0.01 / 1.525 * (chart.curve_mm * outward_normals(chart.curve_mm)).sum(axis=1)[nodes]
+    assert_allclose(chart.curves[1, nodes, 6], expected, atol=2e-4)
+    assert_allclose(chart.curves[:, :, 7], 0.0, atol=2e-4)
+
+
+def test_points_where_the_nominal_is_not_trusted_take_no_part():
+    curves = CHART.curves.copy()
+    curves[:, 300:500, 6] = np.nan
+    points = Part().scan(np.random.default_rng(4), 41.0, 64.0, 1.0, 0.01)
+    still = Motion(pivot_mm=np.zeros(2), z_mm=52.5, rest=np.zeros(3), per_mm=np.zeros(3))
+    node = replace(CHART, curves=curves).lay(points, np.ones(len(points)), still, (0.5, 1.0))[0]
+    every = CHART.project(points)[:, 0]
+    assert_allclose(node, every[(every < 300.0) | (every >= 500.0)], atol=0.0)
 
 
 def test_undoing_a_motion_is_the_way_back_of_its_matrix():
@@ -118,7 +132,7 @@ def test_the_sparser_the_scan_the_wider_the_band(spacing_mm, half_mm):
 
 
 def test_points_are_laid_as_motion_projection_and_steepness_say():
-    """One pass over the points against the three steps that it takes at once."""
+    """One pass over the points against the steps that it takes at once."""
     rng = np.random.default_rng(4)
     points = Part().scan(rng, 41.0, 64.0, 1.0, 0.3)
     motion = Motion(
@@ -127,17 +141,21 @@ def test_points_are_laid_as_motion_projection_and_steepness_say():
         rest=np.array([0.2, -0.1, 0.004]),
         per_mm=np.array([0.01, 0.02, 5e-4]),
     )
-    number, place, rows = CHART.lay(points, motion, 0.5, 0.04)
+    sigma = rng.uniform(0.01, 0.02, len(points))
+    node, height, longer, rows = CHART.lay(points, sigma, motion, (0.5, 0.04))
     back = motion.undo(points)
     foot = CHART.project(back)
-    steep = steepness(foot[:, 0], back[:, 2], CHART.z_mm, CHART.growth_of_nodes, CHART.trusted)
+    three = np.minimum(np.searchsorted(CHART.z_mm[2::2], points[:, 2], side="right"), 3)
+    up = (points[:, 2] - CHART.z_mm[2 * three]) / (CHART.z_mm[2 * three + 2] - CHART.z_mm[2 * three])
+    low, growth = CHART.curves[three, foot[:, 0].astype(int), 6:].T
+    steep = low + up * growth
     near = np.flatnonzero((np.abs(foot[:, 1]) <= 0.5) & (np.abs(steep) <= 0.04))
     assert 0 < len(near) < len(points)
-    np.testing.assert_array_equal(number, near)
-    longer = np.sqrt(1.0 + steep**2)
-    assert_allclose(place, np.column_stack([foot[:, 0], points[:, 2], longer])[near], atol=1e-12)
-    arm, height = back[:, :2] - motion.pivot_mm, points[:, 2:] - 52.5
-    assert_allclose(rows, np.hstack([foot[:, 1:2], arm, foot[:, 2:], height])[near], atol=1e-12)
+    assert_allclose(node, foot[near, 0], atol=1e-12)
+    assert_allclose(height, points[near, 2], atol=0.0)
+    assert_allclose(longer, (sigma * np.sqrt(1.0 + steep**2))[near], rtol=1e-12)
+    arm, over = back[:, :2] - motion.pivot_mm, points[:, 2:] - 52.5
+    assert_allclose(rows, np.hstack([foot[:, 1:2], arm, foot[:, 2:], over])[near], atol=1e-12)
 
 
 def test_heights_sorted_into_bins():
