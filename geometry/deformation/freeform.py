@@ -77,6 +77,10 @@ class Freeform:
     lattice: Lattice
     coefficients: Floats  # (nodes, 4) mm: three of the shift in the lattice's axes, one of the swelling
 
+    def since(self, before: "Freeform") -> "Freeform":
+        """What has changed since another one on the same lattice."""
+        return Freeform(lattice=self.lattice, coefficients=self.coefficients - before.coefficients)
+
     def shift(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Shift (n, 3) and swelling (n,) at points; beyond the lattice both die out smoothly."""
         inside, beyond = self.lattice.local(points_mm)

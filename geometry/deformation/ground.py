@@ -4,16 +4,18 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy.sparse as sp
 
 from geometry.blade.nominal import Nominal
 from geometry.blade.solid import face_areas_mm2, solid_normals
 from geometry.deformation.freeform import Lattice, lattice_over
-from geometry.deformation.offset import Nodes, scatter_nodes
+from geometry.deformation.offset import Nodes, Plate, plate_over, scatter_nodes
 from geometry.deformation.refine import Refined, refine
-from geometry.types import Ints
+from geometry.types import Floats, Ints
 
 COARSER = 2.5  # spacing of the nodes that the wear is fitted to, in those of the offset
 EDGE_CELLS = 0.27  # longest edge of the mesh, in cells of the lattice
+CREASE_COSINE = 0.94  # corner normals that differ more belong to different sides of an edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -23,9 +25,19 @@ class Ground:
     nominal: Nominal
     lattice: Lattice
     refined: Refined
-    nodes: Nodes
+    plate: Plate
+    bulge_mm: Floats  # (nodes,) how far a smooth surface stands over the nominal's facets there
     graph: Ints  # (nodes, k) neighbours
     coarse: Nodes  # what the wear is fitted to
+    from_coarse: sp.csr_array  # (nodes, coarse) carries what is known there
+    side_vertex: Ints  # (sides,) of the refined mesh: every vertex, then the other sides of its edges
+    side_normals: Floats  # (sides, 3)
+    to_sides: sp.csr_array  # (sides, nodes) carries what is known at the nodes
+
+    @property
+    def nodes(self) -> Nodes:
+        """The nodes of the offset."""
+        return self.plate.nodes
 
 
 @lru_cache(maxsize=2)
@@ -35,14 +47,28 @@ def prepare_ground(nominal: Nominal, nodes: int, cells: int) -> Ground:
     corners = solid_normals(nominal.mesh).corner
     refined = refine(nominal.mesh, corners, nominal.airfoil_face, EDGE_CELLS * lattice.cell_mm)
     fine = _scatter(nominal, refined, nodes)
+    coarse = scatter_nodes(fine.points_mm, fine.normals, 1.0, COARSER * fine.spacing_mm)
+    vertex, normals = refined.sides(CREASE_COSINE)
     return Ground(
         nominal=nominal,
         lattice=lattice,
         refined=refined,
-        nodes=fine,
+        plate=plate_over(fine),
+        bulge_mm=_bulge_mm(nominal, corners)[nominal.closest(fine.points_mm).face],
         graph=fine.graph(),
-        coarse=scatter_nodes(fine.points_mm, fine.normals, 1.0, COARSER * fine.spacing_mm),
+        coarse=coarse,
+        from_coarse=coarse.interpolation(fine.points_mm, fine.normals),
+        side_vertex=vertex,
+        side_normals=normals,
+        to_sides=fine.interpolation(refined.mesh.vertices_mm[vertex], normals),
     )
+
+
+def _bulge_mm(nominal: Nominal, corner_normals: Floats) -> Floats:
+    """Mean height (faces,) of a smooth surface through the corners with their normals over each facet."""
+    corners_mm = nominal.mesh.vertices_mm[nominal.mesh.faces]
+    edges_mm, turns = (np.roll(values, -1, axis=1) - values for values in (corners_mm, corner_normals))
+    return np.asarray(np.sum(edges_mm * turns, axis=(1, 2)) / 24.0)
 
 
 def _scatter(nominal: Nominal, refined: Refined, wanted: int) -> Nodes:

@@ -25,6 +25,8 @@ SECTION_SHARE = 0.45  # of the section's extent: over so much wear is alike
 RIPPLE_CELLS = 0.65  # over so much ripple is alike
 SHORTEST_CELLS, LONGEST_EXTENTS = 1.75, 4.0  # bounds of the lengths of wear
 STEPS = 12  # of the search for the prior, at most
+SLOPE_STEP = 1e-3  # of the logarithms, between the slopes whose difference is the curvature
+LOOSEST = 1.0  # of the logarithms: a rival prior is no farther off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,6 +82,11 @@ class Sample:
     value_mm: Floats  # (n,)
     variance_mm2: Floats  # (n,) of the value's noise
 
+    def thinned(self, most: int) -> "Sample":
+        """About `most` of the places, at most."""
+        count = len(self.value_mm)
+        return self.only(np.arange(0, count, max(1, -(-count // most))))
+
     def only(self, chosen: Ints) -> "Sample":
         """The chosen places."""
         return Sample(
@@ -106,20 +113,39 @@ def sample_of(
 
 def likeliest_prior(sample: Sample, start: Prior, lattice: Lattice, most: int) -> Prior:
     """The prior under which about `most` of the displacements are the most probable, sought from `start`."""
-    count = len(sample.value_mm)
-    few = sample.only(np.arange(0, count, -(-count // most)))
-    typical = np.log(typical_prior(lattice).numbers)
+    few, typical = sample.thinned(most), np.log(typical_prior(lattice).numbers)
     bounds = _bounds(lattice, typical)
-
-    def cost(logs: Floats) -> tuple[float, Floats]:
-        value, slopes = _misfit(few, np.exp(logs))
-        off = (logs - typical) / VAGUE
-        return value + 0.5 * float(off @ off), slopes + off / VAGUE
-
     found = minimize(
-        cost, np.log(start.numbers), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS}
+        lambda logs: _unlikely(few, logs, typical),
+        np.log(start.numbers),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": STEPS},
     )
     return Prior.of(np.exp(found.x))
+
+
+def rival_priors(sample: Sample, prior: Prior, lattice: Lattice, most: int) -> tuple[Prior, ...]:
+    """Six priors one standard deviation off the likeliest, along independent directions of its logarithms.
+
+    The curvature of the likelihood of about `most` of the displacements tells how sure the prior is.
+    """
+    few, typical = sample.thinned(most), np.log(typical_prior(lattice).numbers)
+    at = np.log(prior.numbers)
+    steps = at + SLOPE_STEP * np.eye(len(at))
+    here = _unlikely(few, at, typical)[1]
+    curvature = np.array([_unlikely(few, logs, typical)[1] - here for logs in steps]) / SLOPE_STEP
+    certainty, directions = np.linalg.eigh(0.5 * (curvature + curvature.T))
+    sizes = 1.0 / np.sqrt(np.maximum(certainty, LOOSEST**-2))
+    return tuple(Prior.of(np.exp(at + size * along)) for size, along in zip(sizes, directions.T, strict=True))
+
+
+def _unlikely(sample: Sample, logs: Floats, typical: Floats) -> tuple[float, Floats]:
+    """Negative log probability of the displacements and of a prior's logarithms (6,), with slopes (6,)."""
+    value, slopes = _misfit(sample, np.exp(logs))
+    off = (logs - typical) / VAGUE
+    return value + 0.5 * float(off @ off), slopes + off / VAGUE
 
 
 def _bounds(lattice: Lattice, typical: Floats) -> list[tuple[float, float]]:
@@ -163,7 +189,8 @@ class Wear:
     factor: Floats  # (n, n) Cholesky factor of the covariance of the sample
 
     def sigma_mm(self, points_mm: Floats, normals: Floats) -> Floats:
-        """Standard uncertainty (n,) of the wear, without ripple, along the normals of surface points."""
+        """Standard uncertainty (n,) of the wear under its prior, without ripple, along the normals of
+        surface points."""
         lattice, sample = self.freeform.lattice, self.sample
         asked = (lattice.own(points_mm), lattice.own(normals), swell(normals))
         known = (sample.places_mm, sample.normals, sample.swell)
@@ -173,6 +200,25 @@ class Wear:
         moved_mm2 = AFFINE[0] ** 2 + AFFINE[1] ** 2 * aligned
         before_mm2 = moved_mm2 + self.prior.shift_mm**2 + (self.prior.swelling_mm * asked[2]) ** 2
         return np.asarray(np.sqrt(np.maximum(before_mm2 - np.einsum("kn,kn->n", told, told), 0.0)))
+
+    def doubt_mm(self, points_mm: Floats, normals: Floats, most: int) -> Floats:
+        """How far (n,) the wear along the normals might be off because its prior was read from the sample.
+
+        That is how much rival priors would have it otherwise, as about `most` of the places tell.
+        """
+        lattice, few = self.freeform.lattice, self.sample.thinned(most)
+        asked = (lattice.own(points_mm), lattice.own(normals), swell(normals))
+        told_mm = _told(few, self.prior, asked)
+        rivals = rival_priors(few, self.prior, lattice, most)
+        off_mm = [_told(few, rival, asked) - told_mm for rival in rivals]
+        return np.asarray(np.linalg.norm(off_mm, axis=0))
+
+
+def _told(sample: Sample, prior: Prior, asked: tuple[Floats, Floats, Floats]) -> Floats:
+    """The most probable displacement (n,) at places, normals and swell asked for."""
+    sources = cho_solve((_factor(sample, prior.numbers), True), sample.value_mm, check_finite=False)
+    known = (sample.places_mm, sample.normals, sample.swell)
+    return np.asarray(covariance(*asked, *known, prior.numbers, AFFINE) @ sources)
 
 
 def fit_wear(sample: Sample, prior: Prior, lattice: Lattice) -> Wear:

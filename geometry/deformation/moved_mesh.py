@@ -8,11 +8,10 @@ from geometry.deformation.freeform import swell
 from geometry.deformation.ground import Ground
 from geometry.deformation.kriging import Wear
 from geometry.deformation.offset import Nodes, Offset
-from geometry.deformation.refine import Refined
 from geometry.registration.register import Alignment, variance_along
 from geometry.types import Bools, Floats, Ints, Measurand, Measured, NotMeasured
 
-CREASE_COSINE = 0.94  # corner normals that differ more belong to different sides of an edge
+OPEN = 0.05  # of the ripple's variance left: with less the data hold wear and ripple together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,15 +23,18 @@ class NodeValues:
     held: Bools  # (nodes,)
 
 
-def at_nodes(wear: Wear, offset: Offset, ground: Ground) -> NodeValues:
+def at_nodes(wear: Wear, offset: Offset, ground: Ground, places: int) -> NodeValues:
     """Both fields together; where the offset is not held by data the uncertainty of the wear shows."""
     nodes, coarse = offset.nodes, ground.coarse
-    spread_mm = wear.sigma_mm(coarse.points_mm, coarse.normals)
-    wear_mm2 = np.maximum(coarse.interpolation(nodes.points_mm, nodes.normals) @ spread_mm**2, 0.0)
     open_fraction = np.minimum((offset.sigma_mm / offset.prior_sigma_mm) ** 2, 1.0)
+    asked = np.flatnonzero(ground.from_coarse.T @ (open_fraction > OPEN))
+    feet = (coarse.points_mm[asked], coarse.normals[asked])
+    spread_mm2 = np.zeros(len(coarse.points_mm))
+    spread_mm2[asked] = wear.sigma_mm(*feet) ** 2 + wear.doubt_mm(*feet, places) ** 2
+    wear_mm2 = np.maximum(ground.from_coarse @ spread_mm2, 0.0)
     return NodeValues(
         moved_mm=wear.freeform.along(nodes.points_mm, nodes.normals) + offset.value_mm,
-        sigma_mm=np.sqrt(offset.sigma_mm**2 + open_fraction * wear_mm2),
+        sigma_mm=np.sqrt(offset.sigma_mm**2 + ground.bulge_mm**2 + open_fraction * wear_mm2),
         held=offset.held,
     )
 
@@ -52,16 +54,15 @@ def form_deviation(values: NodeValues, nodes: Nodes, alignment: Alignment) -> Me
 
 
 def at_vertices(
-    refined: Refined, wear: Wear, offset: Offset, values: NodeValues
+    ground: Ground, wear: Wear, offset: Offset, values: NodeValues
 ) -> tuple[Floats, Floats, Bools]:
-    """Displacement (n, 3), sigma (n,) and support (n,) of the vertices of a refined mesh.
+    """Displacement (n, 3), sigma (n,) and support (n,) of the vertices of the refined mesh.
 
     Where no node is near, off the airfoil, nothing is known but the wear's prior.
     """
-    vertices, count = refined.mesh.vertices_mm, len(refined.mesh.vertices_mm)
-    vertex, normals = _sides(refined)
-    carry = offset.nodes.interpolation(vertices[vertex], normals)
-    shift, swelling = wear.freeform.shift(vertices)
+    vertices_mm, vertex = ground.refined.mesh.vertices_mm, ground.side_vertex
+    normals, carry, count = ground.side_normals, ground.to_sides, len(vertices_mm)
+    shift, swelling = wear.freeform.shift(vertices_mm)
     along_mm = swelling[vertex] * swell(normals) + carry @ offset.value_mm
     near = _largest(vertex, np.asarray(carry @ np.ones(carry.shape[1])), count) > 0.5
     variance = np.maximum(carry @ values.sigma_mm**2, float(values.sigma_mm.min()) ** 2)
@@ -76,22 +77,6 @@ def _largest(vertex: Ints, values: Floats, count: int) -> Floats:
     result = np.full(count, -np.inf)
     np.maximum.at(result, vertex, values)
     return result
-
-
-def _sides(refined: Refined) -> tuple[Ints, Floats]:
-    """Every vertex with its normal, in order; then once more for each other side of an edge through it."""
-    corner_vertex = refined.mesh.faces.ravel()
-    corner_normal = refined.corner_normals.reshape(-1, 3)
-    _, first = np.unique(corner_vertex, return_index=True)
-    main = corner_normal[first]
-    other = np.flatnonzero(np.einsum("cj,cj->c", corner_normal, main[corner_vertex]) < CREASE_COSINE)
-    keys = np.column_stack([corner_vertex[other], np.round(corner_normal[other] * 64.0).astype(np.int64)])
-    _, extra = np.unique(keys, axis=0, return_index=True)
-    extra = other[extra]
-    return (
-        np.concatenate([np.arange(len(first)), corner_vertex[extra]]),
-        np.concatenate([main, corner_normal[extra]]),
-    )
 
 
 def _least_move(vertex: Ints, normals: Floats, along_mm: Floats, count: int) -> Floats:

@@ -103,6 +103,22 @@ def bending_energy(nodes: Nodes) -> sp.csr_array:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plate:
+    """What the prior of the field needs of its nodes, whatever is measured."""
+
+    nodes: Nodes
+    bending: sp.csr_array  # (nodes, nodes)
+    order: Ints  # (nodes,) in which its equations are a narrow band
+
+
+def plate_over(nodes: Nodes) -> Plate:
+    """The thin plate over these nodes."""
+    bending = bending_energy(nodes)
+    order = reverse_cuthill_mckee(bending, symmetric_mode=True).astype(np.int64)
+    return Plate(nodes=nodes, bending=bending, order=order)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Offset:
     """The fitted field: values and posterior standard deviations at the nodes."""
 
@@ -111,47 +127,47 @@ class Offset:
     sigma_mm: Floats  # (n,)
     prior_sigma_mm: float
     held: Bools  # (n,) scan points speak for the node
-    rms_mm: float  # of the measured offsets about the field
+    misfit_mm: Floats  # (m,) of the measured offsets
 
 
 def fit_offset(
-    nodes: Nodes,
+    plate: Plate,
     feet_mm: Floats,
     normals: Floats,
     offsets_mm: Floats,
     sigma_mm: Floats,
+    count: Floats,
     *,
     prior_sigma_mm: float,
     length_mm: float,
     draws: int,
     rng: np.random.Generator,
 ) -> Offset:
-    """The most probable offset field given measured offsets (m,) at surface points, with its sigma.
+    """The most probable offset field given offsets (m,) at surface points, each the mean of `count` (m,)
+    measured ones, with its sigma.
 
     The prior is a thin plate on an elastic bed: spectrum 1 / (k^4 + 1 / length^4), standard deviation
     `prior_sigma_mm`; in a gap it runs on smoothly and returns to zero within a few `length_mm`.
     """
+    nodes, order = plate.nodes, plate.order
     carry = nodes.interpolation(feet_mm, normals)
     bed = sp.diags_array(nodes.area_mm2 / length_mm**4)
     stiffness = length_mm**2 / (8.0 * prior_sigma_mm**2)
     information = 1.0 / sigma_mm**2
-    system = sp.csr_array(
-        carry.T @ (sp.diags_array(information) @ carry) + stiffness * (bending_energy(nodes) + bed)
-    )
+    system = sp.csr_array(carry.T @ (sp.diags_array(information) @ carry) + stiffness * (plate.bending + bed))
     right = carry.T @ (information * offsets_mm)
-    order = reverse_cuthill_mckee(system, symmetric_mode=True).astype(np.int64)
     factor = _banded_factor(sp.csr_array(system[order][:, order]))
     value, errors = np.empty(len(order)), np.empty((len(order), draws))
     value[order] = cho_solve_banded((factor, True), right[order])
     errors[order], _ = dtbtrs(factor, rng.standard_normal((len(order), draws)), uplo="L", trans="T")
-    votes = np.asarray(abs(carry).T @ np.ones(len(feet_mm)))
+    votes = np.asarray(abs(carry).T @ count)
     return Offset(
         nodes=nodes,
         value_mm=value,
         sigma_mm=np.sqrt(np.mean(errors**2, axis=1)),
         prior_sigma_mm=prior_sigma_mm,
         held=votes >= max(1.0, 0.2 * float(np.median(votes))),
-        rms_mm=float(np.sqrt(np.mean((offsets_mm - carry @ value) ** 2))),
+        misfit_mm=offsets_mm - carry @ value,
     )
 
 

@@ -31,6 +31,22 @@ class Refined:
     parent: Ints  # (faces,) face of the original mesh, ascending
     corner_normals: Floats  # (faces, 3, 3) unit, interpolated in the parent face
 
+    def sides(self, crease_cosine: float) -> tuple[Ints, Floats]:
+        """Every vertex (k,) with its normal (k, 3), in order; then once more for each other side of an edge
+        through it, where corner normals differ by more than the cosine says."""
+        corner_vertex, corner_normal = self.mesh.faces.ravel(), self.corner_normals.reshape(-1, 3)
+        _, first = np.unique(corner_vertex, return_index=True)
+        main = corner_normal[first]
+        along = np.einsum("cj,cj->c", corner_normal, main[corner_vertex])
+        other = np.flatnonzero(along < crease_cosine)
+        alike = np.round(corner_normal[other] * 64.0).astype(np.int64)
+        _, extra = np.unique(np.column_stack([corner_vertex[other], alike]), axis=0, return_index=True)
+        extra = other[extra]
+        return (
+            np.concatenate([np.arange(len(first)), corner_vertex[extra]]),
+            np.concatenate([main, corner_normal[extra]]),
+        )
+
 
 def refine(mesh: Mesh, corner_normals: Floats, bends: Bools, longest_mm: float) -> Refined:
     """`mesh` with every edge of a face that `bends` (faces,) at most `longest_mm` long."""

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.blade.nominal import Nominal
+from geometry.deformation.freeform import Freeform
 from geometry.deformation.ground import Ground, prepare_ground
 from geometry.deformation.kriging import Sample, Wear, fit_wear, likeliest_prior, sample_of, typical_prior
 from geometry.deformation.moved_mesh import at_nodes, at_vertices, form_deviation
 from geometry.deformation.offset import Offset, fit_offset
-from geometry.deformation.votes import NO_NOISE_MM, Found, compare, gather, screen
+from geometry.deformation.votes import NO_NOISE_MM, Found, binned, compare, gather, screen
 from geometry.errors import CannotFitTwin
 from geometry.registration.register import Alignment
 from geometry.robust import TUKEY, biweight, spread
@@ -79,16 +80,16 @@ def fit_twin(
     rng = np.random.default_rng(settings.seed)
     ground = prepare_ground(nominal, min(settings.nodes, max(len(cloud) // 4, 100)), settings.cells)
     rough, rounds, converged = _fit_rounds(scan_mm, mask, ground, settings, rng)
-    found = compare(scan_mm, rough.freeform, ground, nominal.closest(scan_mm))
+    found = compare(scan_mm, rough.freeform, ground)
     near_damage = screen(found, ground, settings.damage_mm, 0)  # what is there tells most of what is lost
     sample = _sample(found, near_damage, rough, settings.damage_mm, settings.damage_mm, ground)
     prior = likeliest_prior(sample, rough.prior, ground.lattice, settings.places)
     wear = fit_wear(sample, prior, ground.lattice)
-    found = found.after(rough.freeform, wear.freeform)
-    sound = screen(found, ground, settings.damage_mm, 1)
-    offset, noise_mm = _fit_ripple(found, sound, point_sigma_mm, ground, settings, rng)
-    values = at_nodes(wear, offset, ground)
-    displacement_mm, sigma_mm, supported = at_vertices(ground.refined, wear, offset, values)
+    change = wear.freeform.since(rough.freeform)
+    sound = screen(found.after(change, ground.nodes), ground, settings.damage_mm, 1)
+    offset, noise_mm, rms_mm = _fit_ripple(found, change, sound, point_sigma_mm, ground, settings, rng)
+    values = at_nodes(wear, offset, ground, settings.places)
+    displacement_mm, sigma_mm, supported = at_vertices(ground, wear, offset, values)
     return Twin(
         mesh=Mesh(
             vertices_mm=ground.refined.mesh.vertices_mm + displacement_mm, faces=ground.refined.mesh.faces
@@ -100,7 +101,7 @@ def fit_twin(
         form_mm=form_deviation(values, ground.nodes, alignment),
         sound=sound[np.argsort(order)],
         noise_mm=noise_mm,
-        sound_rms_mm=offset.rms_mm,
+        sound_rms_mm=rms_mm,
         iterations=rounds,
         converged=converged,
     )
@@ -115,7 +116,7 @@ def _fit_rounds(
     """
     chosen = rng.permutation(len(scan_mm))[: settings.points]
     points_mm = scan_mm[chosen]
-    found = compare(points_mm, None, ground, ground.nominal.closest(points_mm))
+    found = compare(points_mm, None, ground)
     sound = found.usable & ~mask[chosen]
     before_mm = np.zeros(len(ground.nodes.points_mm))
     prior = typical_prior(ground.lattice)
@@ -131,7 +132,7 @@ def _fit_rounds(
         if settled and rounds > LOOSE_ROUNDS:
             return wear, rounds, True
         before_mm = after_mm
-        found = compare(points_mm, wear.freeform, ground, found.near)
+        found = compare(points_mm, wear.freeform, ground)
         sound = screen(found, ground, loose_mm, 0)
     if wear is None:
         raise CannotFitTwin("no round was allowed")
@@ -141,7 +142,11 @@ def _fit_rounds(
 def _sample(
     found: Found, sound: Bools, before: Wear | None, loose_mm: float, damage_mm: float, ground: Ground
 ) -> Sample:
-    """The displacements that the means of the sound points show; those that stand out count for less."""
+    """The displacements that the means of the sound points show; those that stand out count for less.
+
+    While the free form is off, feet lie aside by about as much, and where the surface bends that reads as
+    metal lost: such places count for little until it fits.
+    """
     votes = gather(found, sound, ground.coarse.owner(found.near.points_mm, found.near.normals), ground.coarse)
     residual_mm, goal_mm = votes.along_mm, votes.along_mm
     if before is not None:
@@ -149,31 +154,40 @@ def _sample(
     share_mm2 = votes.noise_mm**2 / np.maximum(votes.count, 1.0)
     some = votes.count > 0.0
     misfit_mm2 = max(spread(residual_mm[some]) ** 2 - float(np.median(share_mm2[some])), NO_NOISE_MM**2)
-    weight = biweight(residual_mm, TUKEY * np.sqrt(misfit_mm2 + share_mm2 + (0.5 * loose_mm) ** 2))
+    aside_mm2 = (0.5 * votes.bend_per_mm * misfit_mm2) ** 2
+    weight = biweight(
+        residual_mm, TUKEY * np.sqrt(misfit_mm2 + share_mm2 + aside_mm2 + (0.5 * loose_mm) ** 2)
+    )
     held = some & (weight > 1e-3)
-    variance_mm2 = (share_mm2 + (FACETS * damage_mm) ** 2)[held] / weight[held]
+    variance_mm2 = (share_mm2 + aside_mm2 + (FACETS * damage_mm) ** 2)[held] / weight[held]
     return sample_of(ground.lattice, votes.centre_mm[held], votes.normals[held], goal_mm[held], variance_mm2)
 
 
 def _fit_ripple(
     found: Found,
+    change: Freeform,
     sound: Bools,
     sigma_mm: Floats,
     ground: Ground,
     settings: TwinSettings,
     rng: np.random.Generator,
-) -> tuple[Offset, float]:
-    """The offset field that the sound points ask for, and their scatter; each counts by its own sigma."""
-    votes = gather(found, sound, found.owner, ground.nodes)
+) -> tuple[Offset, float, float]:
+    """The offset field that the sound points ask for, their scatter, and what it leaves, root mean square.
+
+    The points were compared before the last `change` of the free form; each counts by its own sigma.
+    """
+    votes = gather(found.after(change, ground.nodes), sound, found.owner, ground.nodes)
     held = votes.count >= 3.0
     ripple_mm2 = float(np.mean(votes.along_mm[held] ** 2 - votes.noise_mm**2 / votes.count[held]))
     relative = sigma_mm[sound] / float(np.median(sigma_mm[sound]))
+    bins = binned(found, sound, votes.noise_mm * relative, ground.nodes)
     offset = fit_offset(
-        ground.nodes,
-        found.near.points_mm[sound],
-        found.near.normals[sound],
-        found.along_mm[sound],
-        votes.noise_mm * relative,
+        ground.plate,
+        bins.feet_mm,
+        bins.normals,
+        bins.along_mm - change.along(bins.feet_mm, bins.normals),
+        bins.sigma_mm,
+        bins.count,
         prior_sigma_mm=float(np.sqrt(max(ripple_mm2, NO_NOISE_MM**2))),
         length_mm=RIPPLE_CELLS * ground.lattice.cell_mm,
         draws=settings.draws,
@@ -182,4 +196,5 @@ def _fit_ripple(
     supported = float(offset.nodes.area_mm2[offset.held].sum() / offset.nodes.area_mm2.sum())
     if not supported >= settings.min_supported:
         raise CannotFitTwin(f"sound points hold {supported:.0%} of the airfoil")
-    return offset, votes.noise_mm
+    left_mm2 = bins.scatter_mm2 + float(np.average(offset.misfit_mm**2, weights=bins.count))
+    return offset, votes.noise_mm, float(np.sqrt(left_mm2))

@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from geometry.kernels.neighbours import counting_sort
 from geometry.types import Bools, Floats, Ints
 
 
@@ -68,6 +69,19 @@ def neighbourhood_median(values: Floats, neighbours: Ints, wanted: Bools) -> Flo
         if found > 0:
             medians[i] = np.median(members[:found])
     return medians
+
+
+@njit(cache=True, nogil=True)
+def group_medians(owner: Ints, values: Floats, size: int) -> tuple[Floats, Bools]:
+    """Lower median (size,) of the values (n,) of each owner, and whether there are any; 0 without."""
+    starts, order = counting_sort(owner, size)
+    medians, some = np.zeros(size), np.zeros(size, np.bool_)
+    for g in range(size):
+        first, last = starts[g], starts[g + 1]
+        if last > first:
+            medians[g] = np.sort(values[order[first:last]])[(last - first - 1) // 2]
+            some[g] = True
+    return medians, some
 
 
 @njit(cache=True, nogil=True)

@@ -23,6 +23,7 @@ from geometry.deformation.offset import (
     Nodes,
     bending_energy,
     fit_offset,
+    plate_over,
     scatter_nodes,
 )
 from geometry.deformation.refine import refine
@@ -251,11 +252,12 @@ def test_the_offset_and_its_sigma_are_honest() -> None:
         truth = np.random.default_rng(seed).multivariate_normal(np.zeros(len(prior)), covariance)
         seen = carry @ truth + rng.normal(0.0, 0.01, len(points))
         found = fit_offset(
-            nodes,
+            plate_over(nodes),
             points,
             normals,
             seen,
             np.full(len(points), 0.01),
+            np.ones(len(points)),
             prior_sigma_mm=0.01,
             length_mm=2.0,
             draws=200,
