@@ -11,7 +11,7 @@ from geometry.deformation.offset import Nodes, Offset
 from geometry.registration.register import Alignment, variance_along
 from geometry.types import Bools, Floats, Ints, Measurand, Measured, NotMeasured
 
-OPEN = 0.05  # of the ripple's variance left: with less the data hold wear and ripple together
+OPEN = 0.25  # of the ripple's variance left: with less the data hold wear and ripple together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
-from scipy.linalg.lapack import dtbtrs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from geometry.errors import CannotFitTwin
 from geometry.kernels.neighbours import counting_sort
-from geometry.kernels.thinplate import bending_rows, linear_weights, thin, within
+from geometry.kernels.thinplate import back_substitute, bending_rows, linear_weights, thin, within
 from geometry.types import Bools, Floats, Ints
 
 INTERPOLATION_REACH, INTERPOLATION_WIDTH = 1.8, 20
@@ -159,7 +158,7 @@ def fit_offset(
     factor = _banded_factor(sp.csr_array(system[order][:, order]))
     value, errors = np.empty(len(order)), np.empty((len(order), draws))
     value[order] = cho_solve_banded((factor, True), right[order])
-    errors[order], _ = dtbtrs(factor, rng.standard_normal((len(order), draws)), uplo="L", trans="T")
+    errors[order] = back_substitute(np.ascontiguousarray(factor.T), rng.standard_normal(errors.shape))
     votes = np.asarray(abs(carry).T @ count)
     return Offset(
         nodes=nodes,

@@ -10,7 +10,7 @@ from geometry.deformation.ground import Ground, prepare_ground
 from geometry.deformation.kriging import Sample, Wear, fit_wear, likeliest_prior, sample_of, typical_prior
 from geometry.deformation.moved_mesh import at_nodes, at_vertices, form_deviation
 from geometry.deformation.offset import Offset, fit_offset
-from geometry.deformation.votes import NO_NOISE_MM, Found, binned, compare, gather, screen
+from geometry.deformation.votes import NO_NOISE_MM, Found, binned, compare, gather, ripple_mm, screen
 from geometry.errors import CannotFitTwin
 from geometry.registration.register import Alignment
 from geometry.robust import TUKEY, biweight, spread
@@ -19,6 +19,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh
 
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
+ROUGH = 1.5  # times the places of the prior are enough for a round
 RIPPLE_CELLS = 0.5  # of the lattice, over which ripple is alike
 FACETS = 0.01  # of `damage_mm`: the nominal's facets and normals are no better
 
@@ -33,7 +34,7 @@ class TwinSettings:
 
     cells: int = 400  # of the lattice over the airfoil's box that carries the wear
     rounds: int = 8  # of the fit of the wear, at most
-    points: int = 50_000  # subsample of those rounds
+    points: int = 30_000  # subsample of those rounds
     places: int = 400  # of those, on the surface, whose displacements tell how far wear reaches
     damage_mm: float = 0.03
     nodes: int = 9000  # of the offset field; its spacing follows from the airfoil's area
@@ -124,9 +125,9 @@ def _fit_rounds(
     for rounds in range(1, settings.rounds + 1):
         loose_mm = settings.damage_mm * max(1, LOOSE_ROUNDS + 1 - rounds)
         sample = _sample(found, sound, wear, loose_mm, settings.damage_mm, ground)
-        if rounds <= LOOSE_ROUNDS:
-            prior = likeliest_prior(sample, prior, ground.lattice, settings.places)
-        wear = fit_wear(sample, prior, ground.lattice)
+        if rounds == LOOSE_ROUNDS:  # the first tells where the blade is, not yet how it is worn
+            prior = likeliest_prior(sample, prior, ground.lattice, settings.places // 2)
+        wear = fit_wear(sample.thinned(int(ROUGH * settings.places)), prior, ground.lattice)
         after_mm = wear.freeform.along(ground.nodes.points_mm, ground.nodes.normals)
         settled = bool(np.abs(after_mm - before_mm).max() <= 0.2 * settings.damage_mm)
         if settled and rounds > LOOSE_ROUNDS:
@@ -177,8 +178,6 @@ def _fit_ripple(
     The points were compared before the last `change` of the free form; each counts by its own sigma.
     """
     votes = gather(found.after(change, ground.nodes), sound, found.owner, ground.nodes)
-    held = votes.count >= 3.0
-    ripple_mm2 = float(np.mean(votes.along_mm[held] ** 2 - votes.noise_mm**2 / votes.count[held]))
     relative = sigma_mm[sound] / float(np.median(sigma_mm[sound]))
     bins = binned(found, sound, votes.noise_mm * relative, ground.nodes)
     offset = fit_offset(
@@ -188,7 +187,7 @@ def _fit_ripple(
         bins.along_mm - change.along(bins.feet_mm, bins.normals),
         bins.sigma_mm,
         bins.count,
-        prior_sigma_mm=float(np.sqrt(max(ripple_mm2, NO_NOISE_MM**2))),
+        prior_sigma_mm=ripple_mm(votes, ground.graph),
         length_mm=RIPPLE_CELLS * ground.lattice.cell_mm,
         draws=settings.draws,
         rng=rng,

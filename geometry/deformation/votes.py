@@ -94,6 +94,21 @@ def gather(found: Found, chosen: Bools, owner: Ints, nodes: Nodes) -> Votes:
     )
 
 
+def ripple_mm(votes: Votes, graph: Ints) -> float:
+    """Standard deviation of what the means of the nodes show beyond their noise.
+
+    Neighbours share ripple and no noise, but not all of the ripple; a node's own square has all of it, but
+    noise must be taken off: through much noise the first tells more, through little the second.
+    """
+    held = votes.count >= 3.0
+    mean_mm = np.where(held, votes.along_mm, 0.0)
+    own_mm2 = mean_mm[held] ** 2 - votes.noise_mm**2 / votes.count[held]
+    sure_mm2 = own_mm2.mean() - own_mm2.std() / np.sqrt(len(own_mm2))
+    pairs = (graph >= 0) & held[:, None] & held[graph]
+    shared_mm2 = (mean_mm[:, None] * mean_mm[graph])[pairs].sum() / max(int(pairs.sum()), 1)
+    return float(np.sqrt(max(sure_mm2, shared_mm2, NO_NOISE_MM**2)))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bins:
     """Means of the few points that lie together: all that a field which is smooth between nodes asks of

@@ -21,21 +21,26 @@ def _cubic(t, weights):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def evaluate(points: Floats, counts: Ints, coefficients: Floats) -> Floats:
-    """The spline (n, m) at points (n, 3) inside the lattice; `coefficients` (nodes, m)."""
-    values = np.zeros((len(points), coefficients.shape[1]))
-    per_axis = np.empty((3, 4))
+    """The spline (n, 4) at points (n, 3) inside the lattice; `coefficients` (nodes, 4)."""
+    values = np.empty((len(points), 4))
+    u, v, w = np.empty(4), np.empty(4), np.empty(4)
     for p in range(len(points)):
-        first = 0
-        for axis in range(2, -1, -1):
-            cell = min(max(int(np.floor(points[p, axis])), 0), counts[axis] - 4)
-            _cubic(points[p, axis] - cell, per_axis[axis])
-            first = first * counts[axis] + cell
-        for c in range(4):
-            for b in range(4):
-                across = per_axis[2, c] * per_axis[1, b]
-                row = first + (c * counts[1] + b) * counts[0]
-                for a in range(4):
-                    weight = across * per_axis[0, a]
-                    for m in range(coefficients.shape[1]):
-                        values[p, m] += weight * coefficients[row + a, m]
+        a = min(max(int(np.floor(points[p, 0])), 0), counts[0] - 4)
+        b = min(max(int(np.floor(points[p, 1])), 0), counts[1] - 4)
+        c = min(max(int(np.floor(points[p, 2])), 0), counts[2] - 4)
+        _cubic(points[p, 0] - a, u)
+        _cubic(points[p, 1] - b, v)
+        _cubic(points[p, 2] - c, w)
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        for k in range(4):
+            for j in range(4):
+                across = w[k] * v[j]
+                row = ((c + k) * counts[1] + b + j) * counts[0] + a
+                for i in range(4):
+                    weight = across * u[i]
+                    s0 += weight * coefficients[row + i, 0]
+                    s1 += weight * coefficients[row + i, 1]
+                    s2 += weight * coefficients[row + i, 2]
+                    s3 += weight * coefficients[row + i, 3]
+        values[p, 0], values[p, 1], values[p, 2], values[p, 3] = s0, s1, s2, s3
     return values

@@ -240,3 +240,22 @@ def bending_rows(nodes: Floats, normals: Floats, found: Ints, rho: Floats, reach
                 rows[i, m, t] = value
                 rows[i, m, own] -= value
     return rows
+
+
+@njit(cache=True, nogil=True)
+def back_substitute(bands: Floats, right: Floats) -> Floats:
+    """The solutions (n, k) of L^T x = right (n, k); `bands` (n, width) holds the columns of the lower L, each
+    from its diagonal down."""
+    count, width = bands.shape
+    values = right.copy()
+    for i in range(count - 1, -1, -1):
+        row = values[i]
+        for below in range(1, min(width, count - i)):
+            factor = bands[i, below]
+            if factor != 0.0:
+                other = values[i + below]
+                for k in range(len(row)):
+                    row[k] -= factor * other[k]
+        for k in range(len(row)):
+            row[k] /= bands[i, 0]
+    return values

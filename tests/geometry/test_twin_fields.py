@@ -48,7 +48,7 @@ def test_the_volumetric_spline_is_the_tensor_product() -> None:
     rng = np.random.default_rng(1)
     counts = (5, 6, 7)
     points = rng.uniform(0.0, 1.0, (200, 3)) * (np.array(counts) - 3.0)
-    coefficients = rng.normal(size=(int(np.prod(counts)), 2))
+    coefficients = rng.normal(size=(int(np.prod(counts)), 4))
     found = evaluate(points, np.array(counts), coefficients)
     np.testing.assert_allclose(found, tensor_spline(points, counts, coefficients), atol=1e-12)
 
@@ -108,7 +108,7 @@ def test_covariances_are_those_of_the_formula() -> None:
     joint = joint_covariance(*asked[:3], PRIOR, AFFINE, some.variance_mm2)
     whole = sum(slow_covariance(some, some, PRIOR)) + np.diag(some.variance_mm2)
     np.testing.assert_allclose(joint, np.triu(whole), atol=1e-11)
-    sources = np.random.default_rng(5).normal(size=(30, 2))
+    sources = np.random.default_rng(5).normal(size=(30, 4))
     alike = slow_covariance(some, others, PRIOR * [1.0, 0.0, 1.0, 1.0, 1.0, 1.0])[0]
     bare = slow_covariance(some, others, PRIOR * [1e-9, 0.0, 1.0, 1.0, 1.0, 1.0])[0]
     correlation = (alike - bare) / (PRIOR[0] ** 2 * some.normals @ others.normals.T)
