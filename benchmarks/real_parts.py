@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.views import row_of
 from geometry.blade.nominal import Nominal
-from geometry.damage.broken import Skin
+from geometry.damage.skin import Skin
 from geometry.errors import CannotMeasure
 from geometry.registration.register import Alignment
 from geometry.registration.uncertainty import certainty

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
-from geometry.damage.broken import Skin, frames_along
+from geometry.damage.local_shape import frames_along
+from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
 from geometry.kernels.facing import FacingMarks

@@ -8,7 +8,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
-from geometry.damage.broken import skin_of
+from geometry.damage.local_shape import pieces
+from geometry.damage.skin import skin_of
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean
@@ -154,7 +155,7 @@ def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal) 
     bare = np.flatnonzero(~np.isfinite(sound_mm))
     if not (len(bare) and groups):
         return [NONE for _ in groups]
-    patch = _patches(field.skin_mm[bare], 2.5 * nominal.settings.sample_mm)
+    patch = pieces(field.skin_mm[bare], 2.5 * nominal.settings.sample_mm)
     damaged = np.flatnonzero(owner >= 0)
     distance_mm, nearest = cKDTree(field.scan_mm[damaged]).query(field.skin_mm[bare])
     nearest_owner = owner[damaged[nearest]]
@@ -182,13 +183,6 @@ def _on_twin(nominal: Nominal, twin: Twin) -> Floats:
     undeformed = cKDTree(twin.mesh.vertices_mm - twin.displacement_mm)
     near = np.asarray(undeformed.query(nominal.samples.points_mm)[1])
     return nominal.samples.points_mm + twin.displacement_mm[near]
-
-
-def _patches(points_mm: Floats, link_mm: float) -> Ints:
-    """Component (k,) of points that are joined when nearer than `link_mm`."""
-    pairs = cKDTree(points_mm).query_pairs(link_mm, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), shape=(len(points_mm),) * 2)
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _merged(

@@ -3,7 +3,9 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geometry.damage.broken import BrokenSurface, Skin, frames_along
+from geometry.damage.broken import BrokenSurface
+from geometry.damage.local_shape import frames_along
+from geometry.damage.skin import Skin
 from geometry.errors import CannotRepair
 from geometry.kernels.implicit_solid import column_crossings
 from geometry.types import Floats

@@ -7,16 +7,30 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from geometry.damage.broken import BrokenSurface, Skin
+from geometry.damage.broken import BrokenSurface
+from geometry.damage.skin import Skin
 from geometry.errors import CannotRepair
-from geometry.kernels.implicit import blend_quadrics
+from geometry.kernels.implicit import blend_quadrics, nearest_points
 from geometry.kernels.implicit_solid import column_crossings, nodes_inside
 from geometry.types import Bools, Floats, Mesh
 
 FAR = 1e3  # field value of a node whose side is known but whose distance is not
-REACHES = (0.25, 0.5)  # of the permitted gap: how far about its points the broken surface is continued
 CONTRADICTING = 0.02  # share of the votes on a side that may be wrong before the surface counts as open
+WIDENING = 0.7  # of the blend of quadrics, per distance from the nearest point
+COVER = 2.0  # spacings about a point of sound skin in which no metal is lost
 COLLAR = 3  # nodes that the cut body reaches past the skin
+
+
+OPEN = "the broken surface is open: scan points do not part lost metal from sound"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reach:
+    """How far the broken surface is continued about scan points, those of the sound rim among them, and how
+    far at most about its own."""
+
+    known_mm: float
+    break_mm: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,39 +40,24 @@ class _Grid:
     shape: tuple[int, int, int]
 
 
-def cut_body(broken: BrokenSurface, skin: Skin, max_gap_mm: float, resolution: float, max_nodes: int) -> Mesh:
+def cut_body(
+    broken: BrokenSurface, skin: Skin, reach: Reach, slack_mm: float, resolution: float, max_nodes: int
+) -> Mesh:
     """The closed surface around the lost metal: the broken surface, then well outside the twin.
 
-    `resolution`: grid cells across the square root of the broken area. Within the narrowest reach about its
-    points in which the broken surface closes off the lost metal: farther than half the permitted gap no point
-    may speak for it. Raises `CannotRepair` if it never does.
+    `resolution`: grid cells across the square root of the broken area. The box grows until the lost metal
+    ends inside it. Raises `CannotRepair` if the broken surface, continued so far about its points, does not
+    close the lost metal off.
     """
     step_mm = float(np.sqrt(broken.area_mm2)) / resolution
-    for share in REACHES:
-        body = _body_within(share * max_gap_mm, step_mm, broken, skin, 0.25 * max_gap_mm, max_nodes)
-        if body is not None:
-            return body
-    raise CannotRepair("the broken surface is open: scan points do not part lost metal from sound")
-
-
-def _body_within(
-    reach_mm: float, step_mm: float, broken: BrokenSurface, skin: Skin, slack_mm: float, max_nodes: int
-) -> Mesh | None:
-    """The cut body with so much reach, or None where it is open.
-
-    The box grows until the lost metal ends inside it.
-    """
     margin_mm = (COLLAR + 2) * step_mm
     low, high = broken.raw_mm.min(axis=0) - margin_mm, broken.raw_mm.max(axis=0) + margin_mm
     while True:
         shape = np.ceil((high - low) / step_mm).astype(int) + 1
         if float(np.prod(shape, dtype=float)) > max_nodes:
-            return None
+            raise CannotRepair(OPEN)
         grid = _Grid(origin_mm=low, step_mm=step_mm, shape=(int(shape[0]), int(shape[1]), int(shape[2])))
-        found = _lost_field(grid, broken, skin, reach_mm + 2.0 * step_mm, slack_mm)
-        if found is None:
-            return None
-        field, lost = found
+        field, lost = _lost_field(grid, broken, skin, reach, slack_mm)
         grow_low = np.array([lost.take(0, axis).any() for axis in range(3)])
         grow_high = np.array([lost.take(-1, axis).any() for axis in range(3)])
         if not (grow_low.any() or grow_high.any()):
@@ -68,26 +67,28 @@ def _body_within(
 
 
 def _lost_field(
-    grid: _Grid, broken: BrokenSurface, skin: Skin, reach_mm: float, slack_mm: float
-) -> tuple[Floats, Bools] | None:
+    grid: _Grid, broken: BrokenSurface, skin: Skin, reach: Reach, slack_mm: float
+) -> tuple[Floats, Bools]:
     """A field that is positive where metal is lost and just outside it; and the lost nodes in the twin."""
-    field, nearest_mm = blend_quadrics(
-        grid.shape,
+    around_mm, beyond_mm = reach.known_mm + 2.0 * grid.step_mm, reach.break_mm + 2.0 * grid.step_mm
+    place = grid.shape, grid.origin_mm, grid.step_mm
+    to_break_mm = nearest_points(*place, broken.points_mm, beyond_mm)
+    to_rim_mm = nearest_points(*place, broken.rim.feet_mm, around_mm)
+    band = (to_break_mm <= around_mm) | (np.isfinite(to_break_mm) & np.isfinite(to_rim_mm))
+    field = blend_quadrics(
+        np.where(band, to_break_mm, np.inf),
         grid.origin_mm,
         grid.step_mm,
         broken.points_mm,
         broken.frames,
         broken.bending,
         1.2 * broken.spacing_mm,
-        reach_mm,
+        beyond_mm,
+        WIDENING,
     )
-    band = np.isfinite(nearest_mm)
     inside = _inside(grid, skin)
-    _end_at_rim(field, nearest_mm, inside & band, grid, broken, slack_mm)
-    beyond_band = _lost_beyond_band(inside & ~band, inside & band, field)
-    if beyond_band is None:
-        return None
-    lost = beyond_band | (inside & band & (field > 0.0))
+    _end_at_rim(field, to_break_mm, inside & band, grid, broken, slack_mm)
+    lost = _lost_beyond_band(inside & ~band, inside & band, field) | (inside & band & (field > 0.0))
     beyond = ndimage.binary_dilation(lost, np.ones((3, 3, 3), bool), COLLAR)
     return np.where(band, field, np.where(lost | (beyond & ~inside), FAR, -FAR)), lost
 
@@ -100,26 +101,28 @@ def _inside(grid: _Grid, skin: Skin) -> Bools:
 def _end_at_rim(
     field: Floats, nearest_mm: Floats, band: Bools, grid: _Grid, broken: BrokenSurface, slack_mm: float
 ) -> None:
-    """End the loss, in `field`, where sound skin was seen nearer than the break.
+    """End the loss, in `field`, where sound skin was seen, and nearer than the break.
 
     Beyond its rim the break is continued only to be cut by the twin. Where it runs out flat, or is rough,
-    the two cross anywhere. Lost metal is nowhere nearer to sound skin than to the break, but for the holes
-    between the points of the break: `slack_mm`.
+    the two cross anywhere. Next to a point of sound skin no metal is lost, unless the break is as near but
+    for the holes between its points: `slack_mm`.
     """
     if not len(broken.rim.points_mm):
         return
-    margin_mm = max(1.5 * float(np.median(broken.spacing_mm)), slack_mm)
+    spacing_mm = float(np.median(broken.spacing_mm))
+    margin_mm = max(1.5 * spacing_mm, slack_mm)
     at = np.nonzero(band & (field > 0.0) & (nearest_mm > margin_mm))
     node_mm = grid.origin_mm + grid.step_mm * np.column_stack(at)
     to_rim_mm = cKDTree(broken.rim.feet_mm).query(node_mm)[0]
-    field[at] = np.minimum(field[at], margin_mm + to_rim_mm - nearest_mm[at])
+    covered_mm = np.maximum(margin_mm + to_rim_mm - nearest_mm[at], to_rim_mm - COVER * spacing_mm)
+    field[at] = np.minimum(field[at], covered_mm)
 
 
-def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools | None:
+def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools:
     """The free nodes in the twin, out of reach of the broken surface, that lie on its outer side.
 
-    Each connected region takes the side of the band nodes at its border. None if they contradict each
-    other: then there is a hole in the band.
+    Each connected region takes the side of the band nodes at its border. Raises `CannotRepair` if they
+    contradict each other: then there is a hole in the band.
     """
     region, count = ndimage.label(free)
     votes = np.zeros((count + 1, 2))
@@ -132,7 +135,7 @@ def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools | None:
     lost = votes[:, 1] > votes[:, 0]
     contradicting = votes[1:].min(axis=1).sum()
     if not contradicting <= CONTRADICTING * votes.sum():
-        return None
+        raise CannotRepair(OPEN)
     return np.asarray(lost[region] & free)
 
 

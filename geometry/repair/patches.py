@@ -4,27 +4,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import manifold3d
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from geometry.blade.solid import check_solid, volume_mm3
-from geometry.damage.broken import BrokenSurface, Scan, Skin, find_broken_surface, frames_along, skin_of
+from geometry.blade.solid import volume_mm3
+from geometry.damage.broken import BrokenSurface, Scan, find_broken_surface
 from geometry.damage.damages import Damage, DamageKind
 from geometry.damage.depth import BORDER
+from geometry.damage.skin import Skin, skin_of
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput, CannotRepair
 from geometry.registration.register import Alignment
+from geometry.repair.border import border_of
 from geometry.repair.columns import volume_by_columns
-from geometry.repair.cut_body import cut_body
+from geometry.repair.cut_body import Reach, cut_body
+from geometry.repair.lost_piece import Piece, lost_piece, solid_of
 from geometry.transforms import apply, check_rigid, inverse
-from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, Mesh, NotMeasured, Zone
+from geometry.types import Bools, Cloud, Floats, Measurand, Measured, Mesh, NotMeasured, Zone
 
-BORDER_POINTS = 24  # sound points that tell how the skin meets the patch
-SAME_FACE = 0.9  # least cosine between places on one face of the part
 NEAR_MM = 2.0  # about a patch, where its vertices of the twin are sought
+REACHES = ((0.25, 0.25), (0.5, 0.5), (0.5, 1.25))  # of the permitted gap: about scan points, about the break
+SLACK = 0.25  # of the permitted gap: sound skin may be nearer than the break by so much
 NOT_MEASURED = NotMeasured(reason="was not measured")
 
 
@@ -100,7 +100,7 @@ def find_repairs(
     patches: list[Patch] = []
     failures: dict[int, str] = {}
     if missing:
-        skin, solid = skin_of(twin.mesh), _solid(twin.mesh).as_original()
+        skin, solid = skin_of(twin.mesh), solid_of(twin.mesh).as_original()
         scan = _scan(twin, cloud, alignment, damages)
     for i in missing:
         try:
@@ -163,37 +163,61 @@ def _patch(
     broken = find_broken_surface(
         skin, scan, damage.points, settings.film_sigmas, settings.max_gap_mm, settings.min_points
     )
-    body = cut_body(broken, skin, settings.max_gap_mm, settings.resolution, settings.max_nodes)
-    mesh, outer, dropped_mm3 = _lost_piece(solid, body, settings.sliver_fraction)
-    gap_mm = _broken_gap(mesh, outer, broken)
-    if not gap_mm <= settings.max_gap_mm:
-        raise CannotRepair(f"a hole of {gap_mm:.2f} mm in the scan of the broken surface")
-    volume = volume_mm3(mesh)
-    check = volume_by_columns(broken, skin)
+    piece, gap_mm = _closed_off(broken, skin, solid, settings)
+    volume, check = volume_mm3(piece.mesh), volume_by_columns(broken, skin)
     allowed = settings.agreement * volume + settings.agreement_mm3
     if not abs(volume - check) <= allowed:
         raise CannotRepair(f"two ways to its volume disagree: {volume:.3f} and {check:.3f} mm3")
-    skin_sigma_mm, area_mm2 = _on_lost_skin(mesh, outer, twin)
+    skin_sigma_mm, area_mm2 = _on_lost_skin(piece, twin)
     twin_sigma_mm = float(skin_sigma_mm @ area_mm2 / area_mm2.sum())
     if not twin_sigma_mm <= settings.max_twin_sigma_mm:
         raise CannotRepair(f"over the lost skin the twin is known to {twin_sigma_mm:.2f} mm only")
-    from_twin_mm3 = float(skin_sigma_mm @ area_mm2)
-    sigma = _volume_sigma(mesh, outer, from_twin_mm3, broken, abs(volume - check), dropped_mm3)
-    step, angle = _border(mesh, outer, broken)
+    sigma = _volume_sigma(piece, float(skin_sigma_mm @ area_mm2), broken, abs(volume - check))
+    step, angle = border_of(piece, broken)
     return Patch(
         damage=index,
         zone=damage.zone,
-        mesh=mesh,
-        outer=outer,
+        mesh=piece.mesh,
+        outer=piece.outer,
         watertight=True,
         volume_mm3=Measurand(name="volume_mm3", value=volume, sigma=sigma, unit="mm3"),
         volume_check_mm3=check,
         broken_gap_mm=gap_mm,
         border_step_mm=step,
         border_angle_deg=angle,
-        area_mm2=_lost_area(mesh, outer, area_mm2, broken),
+        area_mm2=_lost_area(piece, area_mm2, broken),
         allowance_mm=settings.allowance_mm,
     )
+
+
+def _closed_off(
+    broken: BrokenSurface, skin: Skin, solid: Any, settings: RepairSettings
+) -> tuple[Piece, float]:
+    """The lost metal, and the diameter of the largest disc on its broken side that holds no scan point.
+
+    By the narrowest continuation of the broken surface that closes the lost metal off and bridges no larger
+    hole than is permitted.
+    """
+    why = CannotRepair("")
+    for known, own in REACHES:
+        reach = Reach(known_mm=known * settings.max_gap_mm, break_mm=own * settings.max_gap_mm)
+        slack_mm = SLACK * settings.max_gap_mm
+        try:
+            body = cut_body(broken, skin, reach, slack_mm, settings.resolution, settings.max_nodes)
+            piece = lost_piece(solid, body, settings.sliver_fraction)
+        except CannotRepair as reason:
+            why = reason
+            continue
+        gap_mm = _broken_gap(piece, broken)
+        if gap_mm <= settings.max_gap_mm:
+            return piece, gap_mm
+        why = CannotRepair(f"a hole of {gap_mm:.2f} mm in the scan of the broken surface")
+    raise why
+
+
+def _broken_gap(piece: Piece, broken: BrokenSurface) -> float:
+    known_mm = np.concatenate([broken.raw_mm, broken.rim.points_mm])
+    return 2.0 * float(np.max(cKDTree(known_mm).query(piece.faces(~piece.outer)[0])[0]))
 
 
 def _total(patches: Sequence[Patch]) -> Measurand:
@@ -203,101 +227,9 @@ def _total(patches: Sequence[Patch]) -> Measurand:
     return Measurand(name="volume_mm3", value=value, sigma=sigma, unit="mm3")
 
 
-def _solid(mesh: Mesh) -> Any:
-    solid = manifold3d.Manifold(
-        manifold3d.Mesh64(np.array(mesh.vertices_mm), np.array(mesh.faces, dtype=np.uint64))
-    )
-    if solid.status() != manifold3d.Error.NoError:
-        raise CannotRepair(f"a body is not a solid: {solid.status()}")
-    return solid
-
-
-def _lost_piece(solid: Any, body: Mesh, sliver_fraction: float) -> tuple[Mesh, Bools, float]:
-    """The twin within the cut body without slivers, which of its faces are the twin's, and what was dropped.
-
-    Components by graph search on the faces: manifold3d's own decomposition does not come back from
-    thousands of pieces.
-    """
-    if volume_mm3(body) < 0.0:
-        body = Mesh(vertices_mm=body.vertices_mm, faces=body.faces[:, ::-1])
-    raw = (solid ^ _solid(body)).to_mesh64()
-    vertices = np.asarray(raw.vert_properties)[:, :3]
-    faces = np.asarray(raw.tri_verts).astype(np.int64)
-    if not len(faces):
-        raise CannotRepair("no metal is missing under the broken surface")
-    component = _components(faces, len(vertices))
-    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
-    volumes = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
-    kept = volumes >= sliver_fraction * volumes.max()
-    own = kept[component]
-    used, compact = np.unique(faces[own], return_inverse=True)
-    mesh = Mesh(vertices_mm=vertices[used], faces=compact.reshape(-1, 3))
-    check_solid(mesh)
-    return mesh, _from_original(raw, solid.original_id())[own], float(np.abs(volumes[~kept]).sum())
-
-
-def _components(faces: Ints, count: int) -> Ints:
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1][faces[:, 0]])
-
-
-def _from_original(raw: Any, origin: int) -> Bools:
-    runs = np.asarray(raw.run_index, dtype=np.int64) // 3
-    mask = np.zeros(len(raw.tri_verts), bool)
-    for own, first, last in zip(raw.run_original_id, runs[:-1], runs[1:], strict=True):
-        mask[first:last] = own == origin
-    return mask
-
-
-def _faces(mesh: Mesh, chosen: Bools) -> tuple[Floats, Floats]:
-    """Middles (n, 3) and areas (n,) of the chosen faces."""
-    a, b, c = np.moveaxis(mesh.vertices_mm[mesh.faces[chosen]], 1, 0)
-    return (a + b + c) / 3.0, 0.5 * np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
-
-
-def _broken_gap(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> float:
-    """Diameter of the largest disc on the patch's broken side that holds no scan point."""
-    if outer.all():
-        raise CannotRepair("the patch has no broken side")
-    known_mm = np.concatenate([broken.raw_mm, broken.rim.points_mm])
-    return 2.0 * float(np.max(cKDTree(known_mm).query(_faces(mesh, ~outer)[0])[0]))
-
-
-def _border(mesh: Mesh, outer: Bools, broken: BrokenSurface) -> tuple[Measured, Measured]:
-    """Largest step (mm) and angle (deg) between the patch's outer skin and the sound skin that it meets.
-
-    At each place of the border a plane through the heights of the nearest `BORDER_POINTS` points that are
-    clear of the break and on the same face of the part; the step is its height in their middle.
-    """
-    feet_mm, normals, height_mm = broken.rim.clear_of(broken.points_mm, 2.0 * float(broken.spacing_mm.max()))
-    if len(feet_mm) < BORDER_POINTS:
-        unseen = NotMeasured(reason=f"{len(feet_mm)} scan points on the sound skin round the patch")
-        return unseen, unseen
-    at_mm = mesh.vertices_mm[np.intersect1d(mesh.faces[outer], mesh.faces[~outer])]
-    _, index = cKDTree(feet_mm).query(at_mm, np.arange(1, BORDER_POINTS + 1))
-    same = np.einsum("ni,nki->nk", normals[index[:, 0]], normals[index]) > SAME_FACE
-    off_mm = feet_mm[index] - (np.einsum("nk,nki->ni", same, feet_mm[index]) / same.sum(1)[:, None])[:, None]
-    across = np.einsum("nij,nkj->nki", frames_along(normals[index[:, 0]])[:, :2], off_mm)
-    inverse = np.linalg.pinv(same[..., None] * np.concatenate([np.ones((*index.shape, 1)), across], axis=2))
-    plane = np.einsum("nik,nk->ni", inverse, height_mm[index])
-    sigma = broken.sigma_mm * np.linalg.norm(inverse, axis=2)
-    slope, slope_sigma = np.linalg.norm(plane[:, 1:], axis=1), np.linalg.norm(sigma[:, 1:], axis=1)
-    i, j = int(np.abs(plane[:, 0]).argmax()), int((slope - slope_sigma).argmax())
-    return (
-        Measurand(name="border_step_mm", value=abs(float(plane[i, 0])), sigma=float(sigma[i, 0]), unit="mm"),
-        Measurand(
-            name="border_angle_deg",
-            value=float(np.rad2deg(np.arctan(slope[j]))),
-            sigma=float(np.rad2deg(slope_sigma[j])),
-            unit="deg",
-        ),
-    )
-
-
-def _on_lost_skin(mesh: Mesh, outer: Bools, twin: Twin) -> tuple[Floats, Floats]:
+def _on_lost_skin(piece: Piece, twin: Twin) -> tuple[Floats, Floats]:
     """Standard uncertainty of the twin (n,) at the outer faces, and the areas (n,) of these."""
-    middle_mm, area_mm2 = _faces(mesh, outer)
+    mesh, (middle_mm, area_mm2) = piece.mesh, piece.faces(piece.outer)
     low_mm, high_mm = mesh.vertices_mm.min(axis=0) - NEAR_MM, mesh.vertices_mm.max(axis=0) + NEAR_MM
     vertices_mm = twin.mesh.vertices_mm
     near = np.flatnonzero(((vertices_mm >= low_mm) & (vertices_mm <= high_mm)).all(axis=1))
@@ -306,8 +238,9 @@ def _on_lost_skin(mesh: Mesh, outer: Bools, twin: Twin) -> tuple[Floats, Floats]
     return twin.sigma_mm[near[cKDTree(vertices_mm[near]).query(middle_mm)[1]]], area_mm2
 
 
-def _lost_area(mesh: Mesh, outer: Bools, area_mm2: Floats, broken: BrokenSurface) -> Measurand:
+def _lost_area(piece: Piece, area_mm2: Floats, broken: BrokenSurface) -> Measurand:
     """Area of the outer skin; its border is known to a part of the spacing of the points."""
+    mesh, outer = piece.mesh, piece.outer
     corner_mm, on_border = mesh.vertices_mm[mesh.faces[outer]], np.isin(mesh.faces[outer], mesh.faces[~outer])
     edge_mm = np.linalg.norm(np.roll(corner_mm, -1, axis=1) - corner_mm, axis=2)
     border_mm = float(edge_mm[on_border & np.roll(on_border, -1, axis=1)].sum())
@@ -315,24 +248,17 @@ def _lost_area(mesh: Mesh, outer: Bools, area_mm2: Floats, broken: BrokenSurface
     return Measurand(name="area_mm2", value=float(area_mm2.sum()), sigma=sigma, unit="mm2")
 
 
-def _volume_sigma(
-    mesh: Mesh,
-    outer: Bools,
-    from_twin_mm3: float,
-    broken: BrokenSurface,
-    difference_mm3: float,
-    dropped_mm3: float,
-) -> float:
+def _volume_sigma(piece: Piece, from_twin_mm3: float, broken: BrokenSurface, difference_mm3: float) -> float:
     """Standard uncertainty of the volume, mm3.
 
     The twin's error is taken as the same all over the lost skin; the noise of the scan points averages
     out; where the patch is thinner than the film its edge is a matter of chance; what the two methods
     disagree by and what was dropped stand for the shape between the points.
     """
-    middle_mm, area_mm2 = _faces(mesh, outer)
+    middle_mm, area_mm2 = piece.faces(piece.outer)
     from_noise = broken.sigma_mm * broken.area_mm2 / np.sqrt(len(broken.raw_mm))
-    broken_mm = _faces(mesh, ~outer)[0]
+    broken_mm = piece.faces(~piece.outer)[0]
     to_break_mm, _ = cKDTree(broken_mm).query(middle_mm, distance_upper_bound=broken.film_mm)
     from_film = broken.film_mm * float(area_mm2[to_break_mm < broken.film_mm].sum()) / np.sqrt(12.0)
-    from_shape = np.hypot(difference_mm3 / np.sqrt(12.0), dropped_mm3 / np.sqrt(3.0))
+    from_shape = np.hypot(difference_mm3 / np.sqrt(12.0), piece.dropped_mm3 / np.sqrt(3.0))
     return float(np.linalg.norm([from_twin_mm3, from_noise, from_film, from_shape]))

@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
 from geometry.blade.solid import solid_normals
-from geometry.damage.broken import Skin
+from geometry.damage.skin import Skin
 from geometry.deformation.offset import Nodes
 from geometry.deformation.refine import Refined, refine
 from geometry.deformation.twin import Twin

@@ -8,8 +8,8 @@ from time import process_time
 import numpy as np
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
-from geometry.damage.broken import Skin
 from geometry.damage.damages import Damage, find_damages
+from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
 from geometry.registration.fit import Fit, felt, fit_kept
 from geometry.registration.register import Alignment, mask_damage, register

@@ -8,7 +8,7 @@ import pytest
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.coverage import CoverageSettings, CoverageStatus, ZoneCoverage, measure_coverage
-from geometry.damage.broken import Skin
+from geometry.damage.skin import Skin
 from geometry.errors import BadInput
 from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
 from geometry.types import Bools, Mesh, Zone

@@ -3,15 +3,22 @@
 import manifold3d
 import numpy as np
 
-from geometry.damage.broken import Skin, frames_along
-from geometry.kernels.implicit import blend_quadrics
+from geometry.damage.local_shape import frames_along
+from geometry.damage.skin import Skin
+from geometry.kernels.implicit import blend_quadrics, nearest_points
 from geometry.kernels.implicit_solid import column_crossings, nodes_inside
 from geometry.types import Floats, Mesh
 from tests.geometry import repair_blades as blades
 
 
 def slow_blend(
-    nodes: Floats, points: Floats, frames: Floats, bending: Floats, width: Floats, reach: float
+    nodes: Floats,
+    points: Floats,
+    frames: Floats,
+    bending: Floats,
+    width: Floats,
+    reach: float,
+    widening: float,
 ) -> tuple[Floats, Floats]:
     signed, nearest = np.full(len(nodes), np.inf), np.full(len(nodes), np.inf)
     for k, node in enumerate(nodes):
@@ -20,7 +27,8 @@ def slow_blend(
         u, v, n = np.einsum("pij,pj->ip", frames, off)
         sag = 0.5 * (bending[:, 0] * u**2 + 2.0 * bending[:, 1] * u * v + bending[:, 2] * v**2)
         sag = sag / np.maximum(1.0, (u**2 + v**2) / (1.5 * width) ** 2)
-        weight = width**2 * np.exp(-((distance / width) ** 2))
+        wide = width**2 + (widening * np.maximum(distance.min() - width, 0.0)) ** 2
+        weight = width**2 * np.exp(-(distance**2 - distance.min() ** 2) / wide)
         weight[distance > reach] = 0.0
         if weight.any():
             signed[k] = (weight * (n - sag)).sum() / weight.sum()
@@ -35,10 +43,11 @@ def test_the_blend_is_the_weighted_mean_of_the_quadrics() -> None:
     frames = frames_along(normals / np.linalg.norm(normals, axis=1)[:, None])
     bending, width = rng.standard_normal((12, 3)), rng.uniform(0.2, 0.4, 12)
     origin, step, shape, reach = np.array([-0.1, 0.05, 0.0]), 0.23, (9, 8, 10), 0.6
-    signed, nearest = blend_quadrics(shape, origin, step, points, frames, bending, width, reach)
+    nearest = nearest_points(shape, origin, step, points, reach)
+    signed = blend_quadrics(nearest, origin, step, points, frames, bending, width, reach, 0.7)
     nodes = origin + step * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
-    slow_signed, slow_nearest = slow_blend(nodes, points, frames, bending, width, reach)
-    np.testing.assert_allclose(signed.ravel(), slow_signed, rtol=1e-9, atol=1e-12)
+    slow_signed, slow_nearest = slow_blend(nodes, points, frames, bending, width, reach, 0.7)
+    np.testing.assert_allclose(signed.ravel(), slow_signed, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(nearest.ravel(), slow_nearest, rtol=1e-9)
 
 
@@ -48,16 +57,10 @@ def test_a_sphere_of_exact_quadrics_is_a_sphere() -> None:
     normals = np.column_stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
     radius = 3.0
     bending = np.tile([-1.0 / radius, 0.0, -1.0 / radius], (len(normals), 1))
-    signed, nearest = blend_quadrics(
-        (41, 41, 41),
-        np.full(3, -4.0),
-        0.2,
-        radius * normals,
-        frames_along(normals),
-        bending,
-        np.full(len(normals), 0.25),
-        0.5,
-    )
+    place, points = (np.full(3, -4.0), 0.2), radius * normals
+    nearest = nearest_points((41, 41, 41), *place, points, 0.5)
+    width = np.full(len(normals), 0.25)
+    signed = blend_quadrics(nearest, *place, points, frames_along(normals), bending, width, 0.5, 0.7)
     node = -4.0 + 0.2 * np.arange(41)
     exact = np.linalg.norm(np.stack(np.meshgrid(node, node, node, indexing="ij"), -1), axis=-1) - radius
     band = nearest < 0.3
