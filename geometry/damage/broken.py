@@ -11,6 +11,9 @@ from geometry.damage.skin import Skin
 from geometry.errors import CannotRepair
 from geometry.types import Bools, Floats, Ints
 
+NEIGHBOURS = 8  # of a point, which tell how deep the break is there
+LIKELY = 0.7  # mean depth of the neighbours, in films, at which a point below the skin lies on the break
+CERTAIN = 2.0  # own depth in films that needs no neighbours but two
 SUPPORT = 2.5  # skin farther than this many point spacings from every sound point is lost or unseen
 
 
@@ -115,14 +118,19 @@ def _points_near(scan: Scan, flagged: Ints, reach_mm: float) -> Ints:
 
 
 def _deep(skin: Skin, scan: Scan, near: Ints, film_sigmas: float) -> Bools:
-    """Which of the points `near` lie below the twin by more than `film_sigmas` of both uncertainties.
+    """Which of the points `near` lie below the twin by more than both uncertainties allow.
 
-    Chance alone takes a few sound points that deep, but not two of the six neighbours as well.
+    Their neighbours decide: where a break runs out towards the skin, a point's own depth would choose those
+    that noise pushed down, and the break would seem deeper and wider than it is. Where it ends steeply the
+    neighbours tell nothing, and a point proves itself, though not alone.
     """
     depth_mm = -skin.closest(scan.points_mm[near])[0]
-    deep = depth_mm > film_sigmas * np.hypot(scan.sigma_mm[near], scan.twin_sigma_mm)
-    _, index = cKDTree(scan.points_mm[near]).query(scan.points_mm[near], min(7, len(near)))
-    return np.asarray(deep & (deep[index[:, 1:]].sum(axis=1) >= 2))
+    films = depth_mm / (film_sigmas * np.hypot(scan.sigma_mm[near], scan.twin_sigma_mm))
+    _, index = cKDTree(scan.points_mm[near]).query(scan.points_mm[near], min(NEIGHBOURS + 1, len(near)))
+    around = np.minimum(films[index[:, 1:]], CERTAIN)
+    likely = (around.mean(axis=1) > LIKELY) & (films > 0.0)
+    proven = (films > CERTAIN) & ((around > 1.0).sum(axis=1) >= 2)
+    return np.asarray(likely | proven)
 
 
 def _sound_points(scan: Scan, shallow: Ints, raw_mm: Floats) -> Floats:

@@ -144,6 +144,15 @@ def test_a_small_hole_is_bridged_and_reported() -> None:
     assert patch.volume_mm3.value == pytest.approx(specimen.removed_mm3[0], rel=0.01)
 
 
+def test_noise_at_the_rim_makes_no_break_deeper() -> None:
+    errors = []
+    for seed in range(3):
+        specimen = scanned("shallow dent", 0.02, seed)
+        (patch,) = repairs_of(specimen).patches
+        errors.append(patch.volume_mm3.value / specimen.removed_mm3[0] - 1.0)
+    assert abs(np.mean(errors)) <= 0.01
+
+
 def test_no_damage_gives_no_patch() -> None:
     specimen = blades.specimen({}, 0.015, np.random.default_rng(0))
     found = repairs_of(specimen)
