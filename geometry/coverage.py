@@ -12,7 +12,7 @@ from geometry.damage.local_shape import frames_along
 from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
-from geometry.kernels.facing import FacingMarks
+from geometry.kernels.facing_marks import FacingMarks
 from geometry.registration.register import Alignment
 from geometry.repair.patches import RepairVolume
 from geometry.transforms import apply

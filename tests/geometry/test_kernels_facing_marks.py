@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geometry.kernels.facing import FacingMarks
+from geometry.kernels.facing_marks import FacingMarks
 
 
 def unit(rng, count):
