@@ -21,6 +21,7 @@ from geometry.registration.fit import (
     unit_twist,
 )
 from geometry.registration.mask import MaskSettings, damaged, form_of
+from geometry.registration.size import check_size
 from geometry.registration.slide import LEAST, slides_mm
 from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
 from geometry.robust import robust_sigma
@@ -84,10 +85,11 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
     then rounds of damage mask and plain least squares on the rest. Neither step moves along a direction that
     the surface does not feel (a constant section with linear twist is a screw). Where noise and form leave
     one open, other places along it are tried for the ends that they would explain; what stays open is
-    reported. Raises `CannotRegister` for a cloud too small or without shape.
+    reported. Raises `CannotRegister` for a cloud too small, in another unit or without shape.
     """
     if len(cloud) < settings.least_points:
         raise CannotRegister(f"{len(cloud)} scan points are fewer than {settings.least_points}")
+    check_size(cloud.points_mm, nominal)
     coarse = find_pose(cloud.points_mm, nominal, settings.coarse)
     cloud = _thinned(cloud, settings.fit_points)
     few_mm = cloud.points_mm[every(len(cloud), settings.robust_points)]

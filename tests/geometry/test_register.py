@@ -222,3 +222,11 @@ def test_settings_that_contradict_themselves_are_refused(wrong):
 def test_coarse_settings_that_contradict_themselves_are_refused():
     with pytest.raises(BadInput, match="coarse"):
         CoarseSettings(cap_mm=0.0)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0 / 25.4, 25.4])
+def test_a_scan_in_another_unit_is_said_to_be_one(factor):
+    scan = blades.scan(BLADE, 0.5, np.random.default_rng(0))
+    cloud = seen_from(scan, pose(3))
+    with pytest.raises(CannotRegister, match="another unit"):
+        register(replace(cloud, points_mm=factor * cloud.points_mm), nominal())
