@@ -89,8 +89,8 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
     """
     if len(cloud) < settings.least_points:
         raise CannotRegister(f"{len(cloud)} scan points are fewer than {settings.least_points}")
-    check_size(cloud.points_mm, nominal)
     coarse = find_pose(cloud.points_mm, nominal, settings.coarse)
+    check_size(cloud.points_mm, nominal)
     cloud = _thinned(cloud, settings.fit_points)
     few_mm = cloud.points_mm[every(len(cloud), settings.robust_points)]
     robust = fit_robust(few_mm, coarse.T_nominal_scan, nominal)
