@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from geometry.kernels.neighbours import counting_sort, k_nearest, sorted_nearest
+from geometry.kernels.neighbours import choose, counting_sort, k_nearest, room_for, sorted_nearest
 
 
 def slow_distances(points, k):
@@ -75,3 +75,20 @@ def test_counting_sort_is_stable():
     starts, order = counting_sort(keys, 4)
     assert starts.tolist() == [0, 2, 3, 5, 5]
     assert order.tolist() == np.argsort(keys, kind="stable").tolist()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), found=st.integers(1, 300), k=st.integers(1, 40), alike=st.booleans())
+def test_the_chosen_are_those_that_a_sort_puts_first(seed, found, k, alike):
+    rng = np.random.default_rng(seed)
+    k = min(k, found)
+    around, _, apart2, ranks = room_for(found + 5)
+    around[:] = rng.permutation(found + 5) + 1000
+    apart2[:] = rng.integers(0, 6, found + 5) / 3.0 if alike else rng.uniform(0.0, 1e-3, found + 5)
+    apart2[found:] = -1.0  # what stands there from before is no candidate
+    near, near2 = np.empty(k, np.int64), np.empty(k)
+    farthest2 = choose(around, apart2, ranks, found, near, near2)
+    order = np.argsort(apart2[:found], kind="stable")[:k]
+    assert np.array_equal(near, around[order])
+    assert np.array_equal(near2, apart2[order])
+    assert farthest2 == near2[-1]
