@@ -113,7 +113,6 @@ class Nominal:
     end_face: Bools  # (faces,) looks down at the bottom of the mesh: no scan sees it
     shell_mm: Floats  # (s, 3) about one point a square millimetre of all that a scan may see
     shell_normals: Floats  # (s, 3)
-    shell_face: Ints  # (s,) on which each lies
     pivot_mm: Floats  # (3,) middle of the required surface
     gyration_mm: float  # its root mean square distance from there
 
@@ -132,7 +131,7 @@ class Nominal:
         self.airfoil_face = self._airfoil_faces()
         self.end_face = self._end_faces()
         self.samples = _sample(self)
-        self.shell_mm, self.shell_normals, self.shell_face = _shell(self)
+        self.shell_mm, self.shell_normals = _shell(self)
         self.pivot_mm = self.samples.points_mm.mean(axis=0)
         self.gyration_mm = float(
             np.sqrt(np.sum((self.samples.points_mm - self.pivot_mm) ** 2, axis=1).mean())
@@ -392,6 +391,6 @@ def _sample(nominal: Nominal) -> SurfaceSamples:
     )
 
 
-def _shell(nominal: Nominal) -> tuple[Floats, Floats, Ints]:
-    points_mm, face, _ = even_points(nominal.mesh, ~nominal.end_face, 1.0)
-    return points_mm, nominal.closest(points_mm).normals, face
+def _shell(nominal: Nominal) -> tuple[Floats, Floats]:
+    points_mm, _, _ = even_points(nominal.mesh, ~nominal.end_face, 1.0)
+    return points_mm, nominal.closest(points_mm).normals

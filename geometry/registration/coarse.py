@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geometry.blade.nominal import Closest, Nominal
+from geometry.blade.nominal import Nominal
 from geometry.errors import BadInput, CannotRegister
 from geometry.registration.fit import every, fit_robust, unit_motions
 from geometry.transforms import apply, inverse, rigid
@@ -124,9 +124,9 @@ def _descend(
         weights = width_mm**2 / (width_mm**2 + distance_mm**2)
         design = np.concatenate([np.cross(moved_mm - nominal.pivot_mm, normals), normals], axis=2) * scale
         weighted = design * weights[:, :, None]
-        across = weighted.transpose(0, 2, 1)
-        normal_matrix = across @ design + 1e-3 * len(points_mm) * np.eye(6)
-        twists = -np.linalg.solve(normal_matrix, across @ height_mm[:, :, None])[:, :, 0] * scale
+        normal_matrix = np.einsum("sni,snj->sij", weighted, design) + 1e-3 * len(points_mm) * np.eye(6)
+        right = np.einsum("sni,sn->si", weighted, height_mm)
+        twists = -np.linalg.solve(normal_matrix, right[:, :, None])[:, :, 0] * scale
         poses = _turned(poses, twists, nominal.pivot_mm)
     return poses
 
@@ -153,39 +153,24 @@ def _rank(
     """The poses that differ, best first; the best three settled by the robust fit on the exact nominal."""
     scored = [_roughly_scored(T, points_mm, nominal, shell, settings) for T in poses]
     different = _different(sorted(scored, key=lambda pose: pose.score_mm), nominal, settings)
-
-    def search(moved_mm: Floats) -> Closest:
-        return _on_shell(moved_mm, nominal, shell)
-
-    settled = [
-        fit_robust(points_mm, pose.T_nominal_scan, nominal, steps=12, search=search) for pose in different[:3]
-    ]
+    settled = [fit_robust(points_mm, pose.T_nominal_scan, nominal, steps=12) for pose in different[:3]]
     again = [_scored(fit.T_nominal_scan, fit.found.distance_mm, settings) for fit in settled]
     best = [min(a, b, key=lambda pose: pose.score_mm) for a, b in zip(again, different[:3], strict=True)]
     ordered = sorted(best + different[3:], key=lambda pose: pose.score_mm)
     return _different(ordered, nominal, settings)
 
 
-def _on_shell(moved_mm: Floats, nominal: Nominal, shell: cKDTree) -> Closest:
-    """The nearest of the shell with its tangent plane, which holds as far as its points are apart.
-
-    A search of the mesh takes ten times as long where a pose is wrong and all points are far off.
-    """
-    apart_mm, nearest = shell.query(moved_mm)
-    feet_mm, normals = nominal.shell_mm[nearest], nominal.shell_normals[nearest]
-    height_mm = np.einsum("nj,nj->n", moved_mm - feet_mm, normals)
-    distance_mm = np.where(apart_mm < SHELL_REACH_MM, height_mm, np.copysign(apart_mm, height_mm))
-    return Closest(
-        points_mm=feet_mm, normals=normals, distance_mm=distance_mm, face=nominal.shell_face[nearest]
-    )
-
-
 def _roughly_scored(
     T_nominal_scan: Floats, points_mm: Floats, nominal: Nominal, shell: cKDTree, settings: CoarseSettings
 ) -> _Pose:
-    """The pose scored against the tangent planes of the shell."""
-    found = _on_shell(apply(T_nominal_scan, points_mm), nominal, shell)
-    return _scored(T_nominal_scan, found.distance_mm, settings)
+    """The pose scored against the tangent planes of the shell, which hold as far as its points are apart."""
+    moved_mm = apply(T_nominal_scan, points_mm)
+    apart_mm, nearest = shell.query(moved_mm, distance_upper_bound=SHELL_REACH_MM)
+    near = np.isfinite(apart_mm)
+    offset_mm = moved_mm[near] - nominal.shell_mm[nearest[near]]
+    distance_mm = np.full(len(points_mm), settings.cap_mm)
+    distance_mm[near] = np.einsum("nj,nj->n", offset_mm, nominal.shell_normals[nearest[near]])
+    return _scored(T_nominal_scan, distance_mm, settings)
 
 
 def _scored(T_nominal_scan: Floats, distance_mm: Floats, settings: CoarseSettings) -> _Pose:

@@ -1,6 +1,5 @@
 """Point-to-plane Gauss-Newton on the exact nominal: robust while damage is in, plain once it is out."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,24 +113,14 @@ def unit_twist(twist: Floats) -> tuple[float, ...]:
 
 
 def fit_robust(
-    points_mm: Floats,
-    T_nominal_scan: Floats,
-    nominal: Nominal,
-    *,
-    steps: int = 60,
-    close_mm: float = 2e-5,
-    search: Callable[[Floats], Closest] | None = None,
+    points_mm: Floats, T_nominal_scan: Floats, nominal: Nominal, *, steps: int = 60, close_mm: float = 2e-5
 ) -> Fit:
-    """The pose by Tukey's weights, their width annealed from wide to 4.685 robust sigmas.
-
-    `search` finds the feet while steps are long, by default the nominal's own.
-    """
-    search = nominal.closest if search is None else search
+    """The pose by Tukey's weights, their width annealed from wide to 4.685 robust sigmas."""
     T, face = T_nominal_scan, np.zeros(0, np.int64)
     weak: tuple[tuple[float, ...], ...] = ()
     for k in range(steps):
         moved_mm = apply(T, points_mm)
-        found = search(moved_mm) if k < len(ANNEAL) else nominal.closest_from(moved_mm, face)
+        found = nominal.closest(moved_mm) if k < len(ANNEAL) else nominal.closest_from(moved_mm, face)
         face = found.face
         weights = tukey(found.distance_mm, ~nominal.end_face[found.face], ANNEAL[min(k, len(ANNEAL) - 1)])
         step = solve_step(nominal, moved_mm, found, weights)
