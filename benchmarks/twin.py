@@ -9,7 +9,11 @@ twin 0.0021 and 0.0041, with noise 0.0080 and 0.0060; 44 minutes and 54 seconds 
 
 - sound, lost: over metal that is there, and over metal that broke away (tip corner, pit);
 - ends: over sound metal within 3 mm of the ends of the airfoil;
-- ratio: root mean square of error over stated sigma where metal is lost; 1 is honest.
+- ratio: root mean square of error over stated sigma where metal is lost, of all seeds and of the worst; 1 is
+  honest, and where one piece is lost its errors go together, so that single seeds differ much;
+- sigma: of the lost part of the section at Z = 90, root mean square, as the twin states it.
+
+The table of wears is of about 60,000 points a scan.
 
 Times are CPU seconds of one thread.
 """
@@ -151,7 +155,7 @@ class Errors:
     at_end: Bools
 
 
-def errors(known: Case, twin: Twin, most: int = 20_000) -> Errors:
+def errors(known: Case, twin: Twin, most: int = 8000) -> Errors:
     before_mm = twin.mesh.vertices_mm - twin.displacement_mm
     on_side = np.flatnonzero((before_mm[:, 2] > 2.0) & (before_mm[:, 2] < blades.SPAN_MM - 1e-3))
     on_side = on_side[:: max(1, len(on_side) // most)]
@@ -174,9 +178,16 @@ def profile_rms(known: Case, mesh: Mesh) -> tuple[float, float]:
     return float(np.sqrt(np.mean(off_mm**2))), float(np.sqrt(np.mean(off_mm[lost] ** 2)))
 
 
-def thesis_blade(nominal: Nominal, noise_mm: float) -> None:
+def stated_mm(known: Case, twin: Twin) -> float:
+    """Root mean square of the twin's sigma about the lost part of the section at `TIP_Z_MM`."""
+    before_mm = twin.mesh.vertices_mm - twin.displacement_mm
+    near = np.flatnonzero(np.abs(before_mm[:, 2] - TIP_Z_MM) < 1.0)
+    return float(np.sqrt(np.mean(twin.sigma_mm[near[gone(known, before_mm[near])]] ** 2)))
+
+
+def thesis_blade(nominal: Nominal, noise_mm: float, seed: int) -> None:
     """One line: section 5.5 at its number of points."""
-    known = case(blades.SHAPES["service"], PITCH_MM, noise_mm, 1, POINTS)
+    known = case(blades.SHAPES["service"], PITCH_MM, noise_mm, seed, POINTS)
     start_s = time.process_time()
     twin = fit_twin(known.cloud, known.broken, in_place(), nominal, TwinSettings())
     fitted_s = time.process_time()
@@ -188,8 +199,9 @@ def thesis_blade(nominal: Nominal, noise_mm: float) -> None:
     whole, lost = profile_rms(known, twin.mesh)
     as_drawn, as_drawn_lost = profile_rms(known, nominal.mesh)
     print(
-        f"{noise_mm:6.3f} {len(known.cloud):8d} {np.abs(error.nominal_mm).mean():8.4f} "
+        f"{noise_mm:6.3f} {seed:4d} {len(known.cloud):8d} {np.abs(error.nominal_mm).mean():8.4f} "
         f"{np.abs(error.off_mm).mean():8.5f} {as_drawn:8.4f} {whole:8.5f} {as_drawn_lost:8.4f} {lost:8.5f} "
+        f"{stated_mm(known, twin):8.5f} "
         f"{fitted_s - start_s:6.1f} {found_s - fitted_s:7.1f} {patched_s - found_s:7.1f}",
         flush=True,
     )
@@ -212,8 +224,10 @@ def wear(nominal: Nominal, name: str, noise_mm: float, seeds: int) -> None:
         )
         rows[-1].append(ratio)
     mean, worst = np.mean(rows, axis=0), np.max(rows, axis=0)
-    shown = [mean[0], mean[1], worst[2], worst[3], mean[4], worst[5], mean[6], worst[7]]
-    print(f"{name:17} {noise_mm:6.3f} " + " ".join(f"{value:8.4f}" for value in shown), flush=True)
+    ratio = np.sqrt(np.mean(np.square(rows)[:, 7]))
+    shown = [mean[0], mean[1], worst[2], worst[3], mean[4], worst[5], mean[6]]
+    numbers = " ".join(f"{value:8.4f}" for value in shown)
+    print(f"{name:17} {noise_mm:6.3f} {numbers} {ratio:6.2f} {worst[7]:6.2f}", flush=True)
 
 
 def main() -> None:
@@ -224,19 +238,21 @@ def main() -> None:
     fit_twin(*_warm(), coarse, TwinSettings())  # kernels compiled
     fine = nominal_of(0.3, 0.06)
     pair = f" {'nominal':>8} {'twin':>8}"
-    print(f"{'':15} {'mean error':>17} {'RMS at Z = 90':>17} {'where lost':>17}  CPU s")
-    print(f"{'noise':>6} {'points':>8}{3 * pair}   twin  damage  repair")
+    fit_twin(*_warm(), fine, TwinSettings())  # what the nominal alone tells is kept
+    print(f"{'':20} {'mean error':>17} {'RMS at Z = 90':>17} {'where lost':>17} {'':>8}  CPU s")
+    print(f"{'noise':>6} {'seed':>4} {'points':>8}{3 * pair} {'sigma':>8}   twin  damage  repair")
     for noise_mm in (0.0, 0.01):
-        thesis_blade(fine, noise_mm)
+        for seed in (1, 2, 3, 4, 5) if chosen.full else (1,):
+            thesis_blade(fine, noise_mm, seed)
     print(f"\n{'wear':17} {'noise':>6} {'nominal':>8} {'sound':>8} {'p99':>8} {'max':>8} ", end="")
-    print(f"{'lost':>8} {'max':>8} {'ends':>8} {'ratio':>8}")
+    print(f"{'lost':>8} {'max':>8} {'ends':>8} {'ratio':>6} {'worst':>6}")
     for name in FIELDS:
         for noise_mm in NOISES_MM:
             wear(coarse, name, noise_mm, 5 if chosen.full else 1)
 
 
 def _warm() -> tuple[Cloud, Bools, Alignment]:
-    known = case(blades.SHAPES["service"], 1.0, 0.01, 0)
+    known = case(blades.SHAPES["service"], 0.45, 0.01, 0)  # enough points for as many nodes
     return known.cloud, known.broken, in_place()
 
 

@@ -11,6 +11,7 @@ from geometry.deformation.offset import Nodes, Offset
 from geometry.registration.register import Alignment, variance_along
 from geometry.types import Bools, Floats, Ints, Measurand, Measured, NotMeasured
 
+CARE = 1.25  # wear need not follow one prior everywhere: so much is its sigma widened where nothing is seen
 OPEN = 0.25  # of the ripple's variance left: with less the data hold wear and ripple together
 
 
@@ -30,7 +31,7 @@ def at_nodes(wear: Wear, offset: Offset, ground: Ground, places: int) -> NodeVal
     asked = np.flatnonzero(ground.from_coarse.T @ (open_fraction > OPEN))
     feet = (coarse.points_mm[asked], coarse.normals[asked])
     spread_mm2 = np.zeros(len(coarse.points_mm))
-    spread_mm2[asked] = wear.sigma_mm(*feet) ** 2 + wear.doubt_mm(*feet, places) ** 2
+    spread_mm2[asked] = CARE**2 * (wear.sigma_mm(*feet) ** 2 + wear.doubt_mm(*feet, places) ** 2)
     wear_mm2 = np.maximum(ground.from_coarse @ spread_mm2, 0.0)
     return NodeValues(
         moved_mm=wear.freeform.along(nodes.points_mm, nodes.normals) + offset.value_mm,

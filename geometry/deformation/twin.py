@@ -19,7 +19,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh
 
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
-ROUGH = 1.5  # times the places of the prior are enough for a round
+EVERY = 2  # a round fits every other place
 RIPPLE_CELLS = 0.5  # of the lattice, over which ripple is alike
 FACETS = 0.01  # of `damage_mm`: the nominal's facets and normals are no better
 
@@ -124,12 +124,13 @@ def _fit_rounds(
     wear: Wear | None = None
     for rounds in range(1, settings.rounds + 1):
         loose_mm = settings.damage_mm * max(1, LOOSE_ROUNDS + 1 - rounds)
-        sample = _sample(found, sound, wear, loose_mm, settings.damage_mm, ground)
+        sample = _sample(found, sound, wear, loose_mm, settings.damage_mm, ground, EVERY)
         if rounds == LOOSE_ROUNDS:  # the first tells where the blade is, not yet how it is worn
             prior = likeliest_prior(sample, prior, ground.lattice, settings.places // 2)
-        wear = fit_wear(sample.thinned(int(ROUGH * settings.places)), prior, ground.lattice)
+        wear = fit_wear(sample, prior, ground.lattice)
         after_mm = wear.freeform.along(ground.nodes.points_mm, ground.nodes.normals)
-        settled = bool(np.abs(after_mm - before_mm).max() <= 0.2 * settings.damage_mm)
+        moved_mm = np.abs(after_mm - before_mm)[found.owner[sound]]  # beyond, only the last fit matters
+        settled = bool(moved_mm.max(initial=0.0) <= 0.2 * settings.damage_mm)
         if settled and rounds > LOOSE_ROUNDS:
             return wear, rounds, True
         before_mm = after_mm
@@ -141,9 +142,17 @@ def _fit_rounds(
 
 
 def _sample(
-    found: Found, sound: Bools, before: Wear | None, loose_mm: float, damage_mm: float, ground: Ground
+    found: Found,
+    sound: Bools,
+    before: Wear | None,
+    loose_mm: float,
+    damage_mm: float,
+    ground: Ground,
+    every: int = 1,
 ) -> Sample:
     """The displacements that the means of the sound points show; those that stand out count for less.
+
+    `every` so many of the coarse nodes is asked, always the same ones, so that rounds compare.
 
     While the free form is off, feet lie aside by about as much, and where the surface bends that reads as
     metal lost: such places count for little until it fits.
@@ -159,7 +168,7 @@ def _sample(
     weight = biweight(
         residual_mm, TUKEY * np.sqrt(misfit_mm2 + share_mm2 + aside_mm2 + (0.5 * loose_mm) ** 2)
     )
-    held = some & (weight > 1e-3)
+    held = some & (weight > 1e-3) & (np.arange(len(some)) % every == 0)
     variance_mm2 = (share_mm2 + aside_mm2 + (FACETS * damage_mm) ** 2)[held] / weight[held]
     return sample_of(ground.lattice, votes.centre_mm[held], votes.normals[held], goal_mm[held], variance_mm2)
 

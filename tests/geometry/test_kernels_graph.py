@@ -3,7 +3,14 @@
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from geometry.kernels.graph import component_sizes, dilate, grow, neighbourhood_mean, neighbourhood_median
+from geometry.kernels.graph import (
+    component_sizes,
+    dilate,
+    group_medians,
+    grow,
+    neighbourhood_mean,
+    neighbourhood_median,
+)
 
 
 def random_graph(seed, count=200, k=3):
@@ -61,3 +68,14 @@ def test_components_join_what_is_near_and_mutual():
     assert 10 < label.max() < 140
     sizes = component_sizes(nearest, distances, 4, 0.9)
     assert (sizes == np.bincount(label)[label]).all()
+
+
+def test_medians_of_groups_are_the_lower_ones_of_their_values():
+    rng = np.random.default_rng(9)
+    owner, values = rng.integers(0, 30, 90), rng.normal(size=90)
+    owner[owner == 7] = 8  # a group without values
+    medians, some = group_medians(owner, values, 30)
+    for g in range(30):
+        own = np.sort(values[owner == g])
+        assert some[g] == (len(own) > 0)
+        assert medians[g] == (own[(len(own) - 1) // 2] if len(own) else 0.0)

@@ -86,6 +86,28 @@ def test_every_form_of_wear_is_followed_through_noise(shape: str) -> None:
     assert case.twin.converged
 
 
+def test_a_strong_bend_does_not_pull_the_thin_edge_aside() -> None:
+    """At first feet lie on the wrong side of the trailing edge, which must not shape what runs on over the
+    lost corner beyond it."""
+
+    def bent(points: Floats) -> Floats:
+        s = points[..., 2] / blades.SPAN_MM
+        turn = np.radians(0.236) * s
+        x, y, c, si = points[..., 0], points[..., 1], np.cos(turn), np.sin(turn)
+        return np.stack([c * x - si * y, si * x + c * y + 0.381 * s**2, points[..., 2]], -1)
+
+    truth = blades.Truth(blades.Shape(blades.ripple, bent))
+    cut = blades.tip_corner()
+    scan = blades.scan(truth, (cut,), pitch_mm=0.45, seed=1)
+    twin = fit_twin(cloud_of(scan.points, 0.001), scan.label > 0, in_place(), nominal(), TwinSettings())
+    before = twin.mesh.vertices_mm - twin.displacement_mm
+    side = (before[:, 2] < blades.SPAN_MM - 1e-3) & (before[:, 2] > 2.0)
+    lost = np.flatnonzero(side & cut.gone(before))
+    error_mm = truth.distance(twin.mesh.vertices_mm[lost])
+    assert np.abs(error_mm).max() < 0.05
+    assert np.sqrt(np.mean((error_mm / twin.sigma_mm[lost]) ** 2)) < 2.0
+
+
 def test_sigma_is_honest_where_seen_and_where_not() -> None:
     for shape in ("service", "bend", "thick"):
         case = fitted(shape, 0.01)

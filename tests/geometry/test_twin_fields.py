@@ -14,6 +14,7 @@ from geometry.deformation.kriging import (
     Sample,
     fit_wear,
     likeliest_prior,
+    rival_priors,
     sample_of,
     typical_prior,
 )
@@ -30,7 +31,7 @@ from geometry.deformation.refine import refine
 from geometry.kernels.covariance import TURN as ALIKE
 from geometry.kernels.covariance import carried, covariance, covariance_slopes, joint_covariance
 from geometry.kernels.ffd import evaluate
-from geometry.kernels.thinplate import TURN
+from geometry.kernels.thinplate import TURN, back_substitute
 from geometry.types import Floats, Mesh
 
 
@@ -180,6 +181,36 @@ def test_a_bend_runs_on_beyond_what_is_seen() -> None:
     assert np.abs(error_mm).max() < 0.02
     far = np.array([[0.0, 0.0, 400.0]])
     np.testing.assert_allclose(wear.freeform.shift(far)[0], 0.0, atol=1e-12)
+
+
+def log_likelihood(sample: Sample, prior: Prior) -> float:
+    """That of the displacements, by numpy alone."""
+    matrix = sum(slow_covariance(sample, sample, prior.numbers)) + np.diag(sample.variance_mm2)
+    misfit = sample.value_mm @ np.linalg.solve(matrix, sample.value_mm)
+    return float(-0.5 * (misfit + np.linalg.slogdet(matrix)[1]))
+
+
+def test_rivals_of_the_prior_are_hardly_less_likely_and_their_doubt_grows_beyond() -> None:
+    lattice, seen, whole, _ = drawn(1)
+    prior = likeliest_prior(seen, Prior.of(PRIOR), lattice, 500)
+    best = log_likelihood(seen, prior)
+    lost = sorted(best - log_likelihood(seen, rival) for rival in rival_priors(seen, prior, lattice, 500))
+    assert lost[0] > 0.25  # one standard deviation costs a half
+    assert lost[4] < 0.9
+    assert lost[5] < 5.0  # the loosest direction is no parabola
+    wear = fit_wear(seen, prior, lattice)
+    points, normals = whole.places_mm @ lattice.axes, whole.normals @ lattice.axes
+    doubt_mm = wear.doubt_mm(points, normals, 500)
+    beyond = whole.places_mm[:, 2] > seen.places_mm[:, 2].max() + 5.0
+    assert doubt_mm[beyond].mean() > 3.0 * doubt_mm[~beyond].mean()
+
+
+def test_back_substitution_solves_the_transposed_band() -> None:
+    rng = np.random.default_rng(12)
+    bands = rng.normal(size=(40, 6)) + 4.0 * (np.arange(6) == 0)
+    lower = sum(np.diag(bands[: 40 - k, k], -k) for k in range(6))
+    right = rng.normal(size=(40, 3))
+    np.testing.assert_allclose(lower.T @ back_substitute(bands, right), right, atol=1e-10)
 
 
 def test_nodes_keep_their_distance_and_cover_the_surface() -> None:
