@@ -10,7 +10,7 @@ from geometry.blade.solid import slice_loops
 from geometry.blade.span import on_line_mm
 from geometry.damage.regions import Field, Region
 from geometry.deformation.twin import Twin
-from geometry.types import Floats, Measurand, Measured, NotMeasured, Zone
+from geometry.types import Floats, Measurand, Measured, Mesh, NotMeasured, Zone
 
 DEEP = 3.0  # sigmas below the twin at which a single point lies on the break for certain
 PLANE_POINTS = 12  # of the break, whose plane ends it
@@ -40,6 +40,7 @@ def normal_depth(region: Region, found: Field) -> Measurand:
     """
     deepest = region.points[int(np.argmax(np.abs(found.smooth_mm[region.points])))]
     around = found.neighbours[deepest]
+    around = around[around >= 0]
     off_mm = found.scan_mm[around] - found.scan_mm[deepest]
     across, along = np.linalg.eigh(off_mm.T @ off_mm)[1][:, :0:-1].T
     depth_mm = np.abs(found.height_mm[around])
@@ -72,7 +73,8 @@ def lowest_mm(region: Region, found: Field, twin: Twin) -> Measured:
     """Height of the lowest point of a damage: where the plane of the lowest of its break leaves the twin.
 
     The lowest of the scan points alone would lie too high, by about their spacing; those that merely stand
-    off the twin next to it too low. A break that is lowest inside the blade ends at its lowest point.
+    off the twin next to it too low. A break that is lowest inside the blade ends at its lowest point. A
+    tail too thin to be seen counts for nothing: metal lost by less than the detection limit.
     """
     break_mm = _break(region, found)
     if len(break_mm) < PLANE_POINTS:
@@ -144,9 +146,9 @@ def edge_loss(region: Region, found: Field, nominal: Nominal, twin: Twin, zone: 
         return EdgeLoss(depth_mm=few, remaining_chord_mm=few)
     low_mm, high_mm = break_mm[:, 2].min(), break_mm[:, 2].max()
     count = int(np.clip((high_mm - low_mm) / found.spacing_mm, 3, HEIGHTS))
-    flat = np.zeros((len(twin.mesh.faces), 3, 3))
+    mesh = between(twin.mesh, low_mm, high_mm)
     heights_mm = np.linspace(low_mm, high_mm, count + 2)[1:-1]
-    rows = [_section_loss(float(z_mm), break_mm, nominal, twin, zone, flat) for z_mm in heights_mm]
+    rows = [_section_loss(float(z_mm), break_mm, nominal, mesh, zone) for z_mm in heights_mm]
     loss_mm, scatter_mm, chord_mm = np.array(rows).T
     worst, shortest = int(np.argmax(loss_mm)), int(np.argmin(chord_mm - loss_mm))
     common_mm = np.hypot(_sigma_mm(region, found), FRONT * found.spacing_mm)
@@ -163,15 +165,14 @@ def edge_loss(region: Region, found: Field, nominal: Nominal, twin: Twin, zone: 
 
 
 def _section_loss(
-    z_mm: float, break_mm: Floats, nominal: Nominal, twin: Twin, zone: Zone, flat: Floats
+    z_mm: float, break_mm: Floats, nominal: Nominal, mesh: Mesh, zone: Zone
 ) -> tuple[float, float, float]:
     """Loss at a height, scatter of the break about its quadric there, and the chord of the twin."""
     outward, edge_mm = _outward(nominal, zone, z_mm)
     across = np.array([-outward[1], outward[0]])
-    loops = slice_loops(twin.mesh, flat, z_mm)
-    loop_mm = max((loop.points_mm for loop in loops), key=len)
+    loop_mm = outline_mm(mesh, z_mm)
     chord_mm = float(np.ptp(loop_mm @ outward))
-    rim_mm = _dense(loop_mm)
+    rim_mm = dense(loop_mm)
     rim_mm = rim_mm[np.linalg.norm(rim_mm - edge_mm, axis=1) < NEAR_EDGE_MM]
     foremost_mm = float((rim_mm @ outward).max())
     near_mm = break_mm[np.argsort(np.abs(break_mm[:, 2] - z_mm))[:FRONT_POINTS]]
@@ -186,6 +187,19 @@ def _section_loss(
     return float(min(skin_mm[left].min(initial=np.inf), cut_mm[~left].min())), scatter_mm, chord_mm
 
 
+def between(mesh: Mesh, low_mm: float, high_mm: float) -> Mesh:
+    """The faces that a plane at a height between those two may cut."""
+    heights_mm = mesh.vertices_mm[mesh.faces, 2]
+    own = (heights_mm.max(axis=1) >= low_mm) & (heights_mm.min(axis=1) <= high_mm)
+    return Mesh(vertices_mm=mesh.vertices_mm, faces=mesh.faces[own])
+
+
+def outline_mm(mesh: Mesh, z_mm: float) -> Floats:
+    """The section's largest loop (m, 2) at a height."""
+    loops = slice_loops(mesh, np.zeros((len(mesh.faces), 3, 3)), z_mm)
+    return max((loop.points_mm for loop in loops), key=len)
+
+
 def _quadric(across_mm: Floats, up_mm: Floats, depth_mm: Floats) -> tuple[Floats, float]:
     """Coefficients of 1, across, across^2 in the full quadric of the depth, and the scatter about it."""
     terms = np.stack(
@@ -195,7 +209,7 @@ def _quadric(across_mm: Floats, up_mm: Floats, depth_mm: Floats) -> tuple[Floats
     return coefficients, float(np.std(depth_mm - terms @ coefficients))
 
 
-def _dense(loop_mm: Floats) -> Floats:
+def dense(loop_mm: Floats) -> Floats:
     """The closed polyline (m, 2) with points `RIM_STEP_MM` apart."""
     closed_mm = np.concatenate([loop_mm, loop_mm[:1]])
     arc_mm = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed_mm, axis=0), axis=1))])

@@ -14,7 +14,7 @@ from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean
 from geometry.registration.register import Alignment
-from geometry.scan.surface import k_nearest
+from geometry.scan.neighbourhood import nearest_of
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints
 
@@ -49,7 +49,7 @@ class Field:
     """The scan against the twin, nominal frame. Distances are signed, positive outside."""
 
     scan_mm: Floats  # (n, 3)
-    neighbours: Ints  # (n, k)
+    neighbours: Ints  # (n, k), -1 none
     spacing_mm: float  # between neighbouring points
     noise_mm: float  # of a single point
     height_mm: Floats  # (n,) distance of each point
@@ -73,7 +73,7 @@ def stand_off(
 ) -> Field:
     """How far each scan point lies off the twin, and how certain that is."""
     scan_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
-    neighbours, distances_mm = k_nearest(scan_mm, min(settings.neighbours + 1, len(scan_mm)))
+    neighbours = nearest_of(cloud, min(settings.neighbours + 1, len(cloud)))
     distance_mm, face = _twin_distances(scan_mm, twin)
     twin_sigma_mm = twin.sigma_mm[twin.mesh.faces[face]].mean(axis=1)
     noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
@@ -81,7 +81,7 @@ def stand_off(
     return Field(
         scan_mm=scan_mm,
         neighbours=neighbours,
-        spacing_mm=float(np.median(distances_mm[:, -1]) * np.sqrt(np.pi / neighbours.shape[1])),
+        spacing_mm=spacing_of(cloud, neighbours),
         noise_mm=noise_mm,
         height_mm=distance_mm,
         smooth_mm=neighbourhood_mean(distance_mm, neighbours[:, 1:]),
@@ -89,6 +89,13 @@ def stand_off(
         on_airfoil=nominal.airfoil_face[twin.nominal_face[face]],
         skin_mm=_on_twin(nominal, twin),
     )
+
+
+def spacing_of(cloud: Cloud, neighbours: Ints) -> float:
+    """Spacing (mm) of the points, from the farthest of their neighbours (n, k; -1 none)."""
+    whole = np.flatnonzero(neighbours[:, -1] >= 0)
+    apart_mm = np.linalg.norm(cloud.points_mm[whole] - cloud.points_mm[neighbours[whole, -1]], axis=1)
+    return float(np.median(apart_mm) * np.sqrt(np.pi / neighbours.shape[1]))
 
 
 def _twin_distances(scan_mm: Floats, twin: Twin) -> tuple[Floats, Ints]:
@@ -132,7 +139,7 @@ def _labels(chosen: Ints, neighbours: Ints) -> Ints:
     """Component (k,) of each chosen point over the neighbour graph."""
     place = np.full(len(neighbours), -1, np.int64)
     place[chosen] = np.arange(len(chosen))
-    near = place[neighbours[chosen]]
+    near = np.where(neighbours[chosen] >= 0, place[neighbours[chosen]], -1)
     row = np.repeat(np.arange(len(chosen)), near.shape[1])
     linked = near.ravel() >= 0
     graph = coo_array(
@@ -159,16 +166,13 @@ def _lost_skin(field: Field, groups: list[tuple[Ints, bool]], nominal: Nominal) 
     damaged = np.flatnonzero(owner >= 0)
     distance_mm, nearest = cKDTree(field.scan_mm[damaged]).query(field.skin_mm[bare])
     nearest_owner = owner[damaged[nearest]]
-    lost: list[list[Ints]] = [[] for _ in groups]
-    for label in np.unique(patch):
-        members = patch == label
-        if distance_mm[members].min() <= 2.0 * reach_mm:
-            for group in np.unique(nearest_owner[members]):
-                lost[group].append(bare[members & (nearest_owner == group)])
+    apart_mm = np.full(patch.max() + 1, np.inf)
+    np.minimum.at(apart_mm, patch, distance_mm)
+    bordering = apart_mm[patch] <= 2.0 * reach_mm
+    lost = [bare[bordering & (nearest_owner == group)] for group in range(len(groups))]
     loose = np.flatnonzero((sound_mm > field.spacing_mm) & np.isfinite(sound_mm))
     return [
-        _to_the_border(np.concatenate(parts), loose, field.skin_mm, nominal) if parts else NONE
-        for parts in lost
+        _to_the_border(samples, loose, field.skin_mm, nominal) if len(samples) else NONE for samples in lost
     ]
 
 

@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from geometry.kernels.implicit_solid import closest_on_triangles, triangle_cells
+from geometry.kernels.parts import over_parts
 from geometry.types import Floats, Ints, Mesh
 
 MAX_CELLS = 2_000_000
@@ -32,18 +33,14 @@ class Skin:
     def closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
         """Signed distance (n,), closest point (n, 3) and its face (n,) for every point (n, 3)."""
         order = self._by_cell(points_mm)  # neighbours ask the same triangles: they lie in the cache
-        back = np.argsort(order)
-        distance_mm, feet_mm, face = closest_on_triangles(
-            np.ascontiguousarray(points_mm[order]),
-            self.triangles_mm,
-            self.normals,
-            self._start,
-            self._member,
-            self.low_mm,
-            self._cell_mm,
-            self._cells,
-        )
+        ordered_mm, back = points_mm[order], np.argsort(order)
+        parts = over_parts(lambda first, end: self._closest(ordered_mm[first:end]), len(points_mm))
+        distance_mm, feet_mm, face = (np.concatenate(part) for part in zip(*parts, strict=True))
         return distance_mm[back], feet_mm[back], face[back]
+
+    def _closest(self, points_mm: Floats) -> tuple[Floats, Floats, Ints]:
+        cells = (self._start, self._member, self.low_mm, self._cell_mm, self._cells)
+        return closest_on_triangles(points_mm, self.triangles_mm, self.normals, *cells)
 
     def _by_cell(self, points_mm: Floats) -> Ints:
         """An order of the points in which those of one cell follow each other."""

@@ -144,6 +144,15 @@ def test_a_small_hole_is_bridged_and_reported() -> None:
     assert patch.volume_mm3.value == pytest.approx(specimen.removed_mm3[0], rel=0.01)
 
 
+def test_a_wall_unseen_up_to_its_rim_is_closed_by_the_sound_skin_beside_it() -> None:
+    specimen = scanned("edge nick", 0.015)
+    points = specimen.cloud.points_mm
+    found = repairs_of(blades.without(specimen, (specimen.on_break == 0) & (points[:, 2] > 21.7)))
+    (patch,) = found.patches
+    assert 1.0 <= patch.broken_gap_mm <= 1.5
+    assert patch.volume_mm3.value == pytest.approx(specimen.removed_mm3[0], rel=0.01)
+
+
 def test_noise_at_the_rim_makes_no_break_deeper() -> None:
     errors = []
     for seed in range(3):
