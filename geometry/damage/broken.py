@@ -14,6 +14,7 @@ from geometry.types import Bools, Floats, Ints
 NEIGHBOURS = 8  # of a point, which tell how deep the break is there
 LIKELY = 0.7  # mean depth of the neighbours, in films, at which a point below the skin lies on the break
 CERTAIN = 2.0  # own depth in films that needs no neighbours but two
+NEAR_SKIN_MM = 0.5  # farther off, a point that no damage claims is none of the blade's
 SUPPORT = 2.5  # skin farther than this many point spacings from every sound point is lost or unseen
 
 
@@ -171,8 +172,9 @@ def _rim(skin: Skin, raw_mm: Floats, sound_mm: Floats, width_mm: float, cell_mm:
     points_mm = sound_mm[_within(sound_mm, raw_mm, width_mm)]
     if len(points_mm):
         points_mm = thinned(points_mm, cell_mm)
-    _, feet_mm, face = skin.closest(points_mm)
-    return Rim(points_mm=points_mm, feet_mm=feet_mm, normals=skin.normals[face])
+    height_mm, feet_mm, face = skin.closest(points_mm)
+    near = np.abs(height_mm) <= NEAR_SKIN_MM
+    return Rim(points_mm=points_mm[near], feet_mm=feet_mm[near], normals=skin.normals[face[near]])
 
 
 def _within(points_mm: Floats, others_mm: Floats, reach_mm: float) -> Ints:

@@ -19,6 +19,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints
 
 SKIN_SPACINGS = 3.0  # skin farther than this many point spacings from every sound point has lost its cover
+LINK_SPACINGS = 4.0  # longer links than this many point spacings, and than `join_mm`, join nothing
 NONE = np.zeros(0, np.int64)
 
 
@@ -35,7 +36,7 @@ class RegionSettings:
     low: float = 3.0
     floor_mm: float = 0.008  # least standard deviation: what the scanner's own errors do not average out
     least_points: int = 12
-    join_mm: float = 1.0  # lost metal this near to other lost metal is one damage
+    join_mm: float = 1.0  # metal nearer than this to other such metal, or to the skin, belongs to it
 
     def __post_init__(self) -> None:
         if not (self.neighbours >= 4 and 0.0 < self.low <= self.high and self.least_points >= 4):
@@ -74,7 +75,7 @@ def stand_off(
     """How far each scan point lies off the twin, and how certain that is."""
     scan_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
     neighbours = nearest_of(cloud, min(settings.neighbours + 1, len(cloud)))
-    distance_mm, face = _twin_distances(scan_mm, twin)
+    distance_mm, _, face = skin_of(twin.mesh).closest(scan_mm)
     twin_sigma_mm = twin.sigma_mm[twin.mesh.faces[face]].mean(axis=1)
     noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
     mean_sigma_mm = noise_mm / np.sqrt(neighbours.shape[1])
@@ -98,23 +99,23 @@ def spacing_of(cloud: Cloud, neighbours: Ints) -> float:
     return float(np.median(apart_mm) * np.sqrt(np.pi / neighbours.shape[1]))
 
 
-def _twin_distances(scan_mm: Floats, twin: Twin) -> tuple[Floats, Ints]:
-    distance_mm, _, face = skin_of(twin.mesh).closest(scan_mm)
-    return distance_mm, face
-
-
 def find_regions(field: Field, nominal: Nominal, settings: RegionSettings) -> list[Region]:
-    """The regions of missing and of excess metal on the airfoil, each with the skin that it has lost."""
-    groups = [
-        (points, missing)
-        for missing, sign in ((True, -1.0), (False, 1.0))
-        for points in _connected(sign * field.smooth_mm, sign * field.height_mm, field, settings)
+    """The regions of missing and of excess metal on the airfoil, each with the skin that it has lost.
+
+    What stands over the skin is metal of the blade only where it comes near it: a clamp or a reflection
+    beside the blade is no damage.
+    """
+    absent = _connected(-field.smooth_mm, -field.height_mm, field, settings)
+    excess = [
+        points
+        for points in _connected(field.smooth_mm, field.height_mm, field, settings)
+        if field.height_mm[points].min() <= settings.join_mm
     ]
+    groups = [(points, True) for points in absent] + [(points, False) for points in excess]
     lost = _lost_skin(field, groups, nominal)
-    absent, excess = [i for i, g in enumerate(groups) if g[1]], [i for i, g in enumerate(groups) if not g[1]]
-    merged = _merged([(groups[i][0], lost[i]) for i in absent], field, nominal, settings.join_mm)
+    merged = _merged(list(zip(absent, lost, strict=False)), field, nominal, settings.join_mm)
     regions = [Region(points=points, lost=skin, missing=True) for points, skin in merged]
-    regions += [Region(points=groups[i][0], lost=NONE, missing=False) for i in excess]
+    regions += [Region(points=points, lost=NONE, missing=False) for points in excess]
     return sorted(regions, key=lambda region: -len(region.points))
 
 
@@ -130,16 +131,18 @@ def _connected(mean_mm: Floats, own_mm: Floats, field: Field, settings: RegionSe
     proven = field.on_airfoil & (own_mm > settings.low * np.maximum(field.noise_mm, field.sigma_mm))
     wider = dilate(reached, field.neighbours) & proven
     chosen = np.flatnonzero(wider | (reached & (own_mm > 0.5 * mean_mm)))
-    labels = _labels(chosen, field.neighbours)
+    labels = _labels(chosen, field, max(LINK_SPACINGS * field.spacing_mm, settings.join_mm))
     groups = [chosen[labels == label] for label in np.unique(labels)]
     return [group for group in groups if len(group) >= settings.least_points]
 
 
-def _labels(chosen: Ints, neighbours: Ints) -> Ints:
-    """Component (k,) of each chosen point over the neighbour graph."""
-    place = np.full(len(neighbours), -1, np.int64)
+def _labels(chosen: Ints, field: Field, link_mm: float) -> Ints:
+    """Component (k,) of each chosen point over the neighbour graph, whose longer links join nothing."""
+    neighbours = field.neighbours[chosen]
+    place = np.full(len(field.scan_mm), -1, np.int64)
     place[chosen] = np.arange(len(chosen))
-    near = np.where(neighbours[chosen] >= 0, place[neighbours[chosen]], -1)
+    apart_mm = np.linalg.norm(field.scan_mm[neighbours] - field.scan_mm[chosen, None], axis=2)
+    near = np.where((neighbours >= 0) & (apart_mm <= link_mm), place[neighbours], -1)
     row = np.repeat(np.arange(len(chosen)), near.shape[1])
     linked = near.ravel() >= 0
     graph = coo_array(
