@@ -4,14 +4,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from geometry.sections.airfoil import measure_sections
 from geometry.sections.chart import NODES, SectionSettings, unroll
 from geometry.sections.measurands import define
 from geometry.sections.profile import cover_zones
 from geometry.types import Measurand, NotMeasured
+from station.verdict import Word, judge
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part, cloud_of
 from tests.geometry.test_airfoil import alignment
+from tests.station.parts import GATES, measurement, plan
 
 Z = 52.5
 NOMINAL, SETTINGS = AnalyticNominal(Blade()), SectionSettings()
@@ -46,6 +50,11 @@ def without(start_mm, width_mm):
     return points[~gone], inside
 
 
+@cache
+def measured_without(start_mm, width_mm):
+    return measure(without(start_mm, width_mm)[0])
+
+
 def gaps():
     rng = np.random.default_rng(5)
     anywhere = [(rng.uniform(0.0, CHART.perimeter_mm), part) for part in PARTS]
@@ -56,8 +65,8 @@ def gaps():
 @pytest.mark.parametrize(("start_mm", "part"), gaps())
 def test_nothing_is_reported_across_a_gap(start_mm, part):
     width = part * CHART.perimeter_mm
-    points, inside = without(start_mm, width)
-    section = measure(points)
+    _, inside = without(start_mm, width)
+    section = measured_without(start_mm, width)
     for name, support in SUPPORTS.items():
         if (support & inside).any():
             assert isinstance(section.measurands[name], NotMeasured), name
@@ -68,8 +77,7 @@ def test_nothing_is_reported_across_a_gap(start_mm, part):
 
 @pytest.mark.parametrize(("start_mm", "part"), gaps())
 def test_what_was_proven_bad_is_never_proven_good_with_fewer_points(start_mm, part):
-    points, _ = without(start_mm, part * CHART.perimeter_mm)
-    before, after = _whole(), measure(points)
+    before, after = _whole(), measured_without(start_mm, part * CHART.perimeter_mm)
     for name, old in before.measurands.items():
         new = after.measurands[name]
         if isinstance(old, Measurand) and isinstance(new, Measurand):
@@ -83,6 +91,66 @@ def test_what_was_proven_bad_is_never_proven_good_with_fewer_points(start_mm, pa
 @cache
 def _whole():
     return measure(scanned()[0])
+
+
+def limits(serviceable, repairable):
+    """Limits of the profile, with others that the part is well inside."""
+    wide = {"serviceable": 1.0, "repairable": 2.0}
+    others = dict.fromkeys(("position_mm", "orientation_deg", "chord_mm", "max_thickness_mm"), wide)
+    return {"section": {**others, "profile_mm": {"serviceable": serviceable, "repairable": repairable}}}
+
+
+PLANS = {
+    Word.SCRAP: plan(limits(0.05, 0.1), (Z,)),
+    Word.REPAIR: plan(limits(0.1, 0.4), (Z,)),
+    Word.PASS: plan(limits(0.2, 0.4), (Z,)),
+}
+
+
+def words(points):
+    """The station's verdict by each plan on a blade that this section alone can fail."""
+    seen = measurement(sections=(measure(points),))
+    return {truth: judge(seen, each, GATES).verdict for truth, each in PLANS.items()}
+
+
+@cache
+def sparse():
+    points = Part(deviation=bump).scan(np.random.default_rng(8), 48.0, 57.0, 0.3, 0.012)
+    return points, CHART.arc_at(CHART.project(points)[:, 0])
+
+
+def test_the_whole_scan_has_the_verdict_of_its_plan():
+    assert words(sparse()[0]) == {truth: truth for truth in PLANS}
+
+
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(
+    start=st.one_of(st.just(None), st.floats(0.0, 1.0)),
+    part=st.floats(0.01, 0.4),
+    share=st.sampled_from([1.0, 1.0, 0.5, 0.2, 0.05, 0.01]),
+    seed=st.integers(0, 99),
+)
+def test_deleting_points_never_makes_a_verdict_better(start, part, share, seed):
+    """A gap anywhere (None: over the worst deviation) and points thinned at random leave SCRAP and REPAIR as
+    they are or make them HOLD; a gap leaves nothing to PASS either."""
+    points, arc = sparse()
+    perimeter = CHART.perimeter_mm
+    low = WORST_MM - 0.5 * part * perimeter if start is None else start * perimeter
+    kept = (arc - low) % perimeter >= part * perimeter
+    kept &= np.random.default_rng(seed).random(len(points)) < share
+    found = words(points[kept])
+    assert all(word in (truth, Word.HOLD) for truth, word in found.items())
+    if part * perimeter > SETTINGS.max_gap_mm:
+        assert set(found.values()) == {Word.HOLD}
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(share=st.floats(0.3, 1.0), seed=st.integers(0, 99))
+def test_what_a_gap_holds_back_is_held_back_with_fewer_points(share, seed):
+    points, arc = sparse()
+    kept = (arc - WORST_MM + 2.0) % CHART.perimeter_mm >= 4.0
+    kept &= np.random.default_rng(seed).random(len(points)) < share
+    assert set(words(points[kept]).values()) == {Word.HOLD}
 
 
 def test_zones_are_covered_by_arc_length_not_by_count():
