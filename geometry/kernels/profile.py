@@ -46,7 +46,7 @@ def _search(curves: Floats, three: int, up: float, x: float, y: float, starts: t
                     k = wrap(j + direction, m)
                     nx, ny = _node(curves, three, up, k)
                     d2 = (nx - x) ** 2 + (ny - y) ** 2
-                    if d2 >= best:
+                    if not d2 < best:
                         break
                     j, best = k, d2
             stride //= 4
@@ -70,7 +70,8 @@ def _slide(curves: Floats, three: int, up: float, x: float, y: float, start: int
         along = ((x - nx) * ex + (y - ny) * ey) / (ex * ex + ey * ey + 1e-300)
         if -0.5 <= along <= 1.0:
             return j, (nx - x) ** 2 + (ny - y) ** 2
-        j = wrap(j + math.floor(min(max(along, -40.0), 40.0) + 0.5), m)
+        jump = along if abs(along) < 40.0 else math.copysign(40.0, along)
+        j = wrap(j + math.floor(jump + 0.5), m)
     return j, math.inf
 
 

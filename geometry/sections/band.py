@@ -22,8 +22,9 @@ from geometry.kernels.profile_spline import (
     gather,
 )
 from geometry.kernels.tensor_spline import band_bins, band_misfit, cubic_weights
-from geometry.sections.chart import NODES, Chart, Motion, SectionSettings, edge_width, outward_normals
+from geometry.sections.chart import NODES, Chart, SectionSettings, edge_width, outward_normals
 from geometry.sections.curve import centroid, centroid_gradient, node_shares
+from geometry.sections.motion import Motion
 from geometry.types import Bools, Floats
 
 _PILOT_POINTS = 10_000  # of a band, to tell outliers ...
@@ -180,7 +181,7 @@ def onto_chart(
     On a slanted surface the distance in the plane is longer than along the normal, and so is its sigma.
     """
     limits = settings.capture_mm, settings.steepest
-    node, z_mm, sigma_mm, rows = chart.lay(points_mm, sigma_mm, motion, limits)
+    node, z_mm, sigma_mm, rows = chart.lay(points_mm, sigma_mm, motion.terms, limits)
     rows[:, 5] /= settings.band_mm
     return Band(node=node, z_mm=z_mm, sigma_mm=sigma_mm, rows=rows)
 

@@ -1,6 +1,6 @@
 """The nominal airfoil near a section, unrolled: arc length and height address the surface.
 
-A part is seen on the chart after its own rigid motion in the plane has been undone.
+A part is seen on the chart after its own rigid motion in the plane (`motion`) has been undone.
 """
 
 from collections.abc import Callable
@@ -15,12 +15,10 @@ from scipy.spatial import cKDTree
 from geometry.blade.nominal import Nominal, NominalSection
 from geometry.errors import BadInput
 from geometry.kernels.airfoil import closed_normals, closed_steps
-from geometry.kernels.profile import lay, project, undo_motion
-from geometry.robust import TUKEY, biweight, spread
+from geometry.kernels.profile import lay, project
 from geometry.types import Bools, Floats, Ints
 
 NODES = 2048  # of a profile; half on each side between the edges
-MOTION_POINTS = 2000  # tell a section's motion as well as all do
 
 
 Freedom = Literal["x", "y", "rotation"]
@@ -140,12 +138,15 @@ class Chart:
         return growth
 
     def lay(
-        self, points_mm: Floats, sigma_mm: Floats, motion: "Motion", limits: tuple[float, float]
+        self,
+        points_mm: Floats,
+        sigma_mm: Floats,
+        motion: tuple[Floats, float, Floats, Floats],
+        limits: tuple[float, float],
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """What of the points (n, 3), their motion undone, is near and upright enough: see the kernel."""
-        moved = motion.pivot_mm, motion.z_mm, motion.rest, motion.per_mm
         surface = self.z_mm, self.curves, self.seeds, self.across_mm, self.corner_mm, self.cell_mm
-        return lay(np.ascontiguousarray(points_mm), sigma_mm, moved, surface, limits)
+        return lay(np.ascontiguousarray(points_mm), sigma_mm, motion, surface, limits)
 
     def arc_at(self, node: Floats) -> Floats:
         """Arc length on the section of node coordinates."""
@@ -313,57 +314,3 @@ def _seeds(nodes_mm: Floats, here: int) -> tuple[Ints, Floats, Floats, float]:
     rows = np.arange(len(at))
     other = np.where(away[rows, 1 - first] - away[rows, first] < doubt, nodes[rows, 1 - first], -1)
     return np.column_stack([nodes[rows, first], other]).reshape(*count, 2), across, corner, cell
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motion:
-    """A rigid motion in the plane about `pivot_mm`, linear in height: (x, y in mm, turn in rad) + slope."""
-
-    pivot_mm: Floats  # (2,)
-    z_mm: float
-    rest: Floats  # (3,)
-    per_mm: Floats  # (3,)
-
-    def undo(self, points_mm: Floats) -> Floats:
-        """Points (n, 3) taken back onto the nominal."""
-        points = np.ascontiguousarray(points_mm)
-        return undo_motion(points, self.pivot_mm, self.z_mm, self.rest, self.per_mm)
-
-    def do(self, curve_mm: Floats) -> Floats:
-        """A curve (m, 2) of the section itself, taken onto the part."""
-        c, s = np.cos(self.rest[2]), np.sin(self.rest[2])
-        x, y = (curve_mm - self.pivot_mm).T
-        return np.column_stack([c * x - s * y, s * x + c * y]) + self.pivot_mm + self.rest[:2]
-
-
-def rigid_columns(points_mm: Floats, normals: Floats, pivot_mm: Floats, height: Floats) -> Floats:
-    """(n, 6): growth of the signed distance with the section's shift x, y and turn, and with their slopes."""
-    lever = normals[:, 1] * (points_mm[:, 0] - pivot_mm[0]) - normals[:, 0] * (points_mm[:, 1] - pivot_mm[1])
-    still = np.column_stack([normals, lever])
-    return np.hstack([still, still * height[:, None]])
-
-
-def find_motion(chart: Chart, points_mm: Floats) -> Motion:
-    """How the part's section is moved against the nominal one, robustly.
-
-    In service a blade bends and untwists: taken out first, what is left is small against an edge radius.
-    A prior of 1 mm and 0.02 rad, a tenth of it per mm of height, holds what the points do not tell.
-    """
-    pivot, z_mm = chart.curve_mm.mean(axis=0), chart.section_z_mm
-    prior = np.array([1.0, 1.0, 0.02, 0.1, 0.1, 0.002]) ** -2.0
-    total = np.zeros(6)
-    some = points_mm[:: max(1, len(points_mm) // MOTION_POINTS)]
-    for _ in range(6):
-        motion = Motion(pivot_mm=pivot, z_mm=z_mm, rest=total[:3], per_mm=total[3:])
-        back = motion.undo(some)
-        foot = chart.project(back)
-        residual = foot[:, 1]
-        scale = spread(residual) + 1e-6
-        weight = biweight(residual, TUKEY * scale) / scale**2
-        columns = rigid_columns(back, foot[:, 2:], pivot, back[:, 2] - z_mm)
-        normal = columns.T @ (columns * weight[:, None]) + np.diag(prior)
-        step = np.linalg.solve(normal, columns.T @ (weight * residual) - prior * total)
-        total = total + step
-        if np.abs(step[:2]).max() < 1e-4 and abs(step[2]) < 1e-5:
-            break
-    return Motion(pivot_mm=pivot, z_mm=z_mm, rest=total[:3], per_mm=total[3:])

@@ -82,7 +82,7 @@ def min_radius(curve_mm: Floats, end: Edge, window_mm: float) -> Estimate:
 
     Each is the radius of the circle through the ends and the middle of its window; the narrower the
     window, the noisier the radius. The least of many scatters less than each: the gradient is that of the
-    one window, and the sigma from it a bound.
+    one window, and the sigma from it a bound, up to a third too large.
     """
     edge = _unroll(curve_mm, end)
     node = _inside(end)

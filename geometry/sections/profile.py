@@ -18,14 +18,12 @@ from geometry.sections.band import Knots, band_of, onto_chart, robust_fit
 from geometry.sections.chart import (
     NODES,
     Chart,
-    Motion,
     SectionSettings,
     curvature,
-    find_motion,
     outward_normals,
-    rigid_columns,
     unroll,
 )
+from geometry.sections.motion import Motion, find_motion, rigid_columns
 from geometry.types import Bools, Floats, Ints
 
 _BIN_MM, _MOST_BINS = 0.25, 1 << 16  # of height, in which points are found

@@ -13,10 +13,11 @@ from geometry.blade.nominal import Nominal
 from geometry.errors import CannotMeasure
 from geometry.registration.register import Alignment, pose_covariance
 from geometry.sections.airfoil import Section, SectionStatus
-from geometry.sections.chart import NODES, Chart, SectionSettings, find_motion, outward_normals, unroll
+from geometry.sections.chart import NODES, Chart, SectionSettings, outward_normals, unroll
 from geometry.sections.curve import Estimate, node_shares
 from geometry.sections.form import share_beyond_sigma
 from geometry.sections.measurands import Definition, define, form, place, shape
+from geometry.sections.motion import find_motion
 from geometry.sections.profile import Gap, Scan, explain_gaps, find_gaps
 from geometry.thesis.rwlls_profile import ClosedProfile, RwllsSettings, reconstruct_thesis
 from geometry.transforms import apply

@@ -10,8 +10,9 @@ from geometry.kernels.profile import nearest_nodes, sort_by_height
 from geometry.kernels.profile_spline import curvature_penalty, gather, solve, stencil
 from geometry.kernels.tensor_spline import band_bins, band_misfit, tensor_values
 from geometry.sections.band import band_of
-from geometry.sections.chart import Motion, SectionSettings, curvature, outward_normals, rigid_columns, unroll
+from geometry.sections.chart import SectionSettings, curvature, outward_normals, unroll
 from geometry.sections.curve import centroid
+from geometry.sections.motion import Motion, rigid_columns
 from geometry.sections.profile import Scan, reconstruct
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part
 
@@ -82,7 +83,7 @@ def test_points_where_the_nominal_is_not_trusted_take_no_part():
     curves[:, 300:500, 6] = np.nan
     points = Part().scan(np.random.default_rng(4), 41.0, 64.0, 1.0, 0.01)
     still = Motion(pivot_mm=np.zeros(2), z_mm=52.5, rest=np.zeros(3), per_mm=np.zeros(3))
-    node = replace(CHART, curves=curves).lay(points, np.ones(len(points)), still, (0.5, 1.0))[0]
+    node = replace(CHART, curves=curves).lay(points, np.ones(len(points)), still.terms, (0.5, 1.0))[0]
     every = CHART.project(points)[:, 0]
     assert_allclose(node, every[(every < 300.0) | (every >= 500.0)], atol=0.0)
 
@@ -142,7 +143,7 @@ def test_points_are_laid_as_motion_projection_and_steepness_say():
         per_mm=np.array([0.01, 0.02, 5e-4]),
     )
     sigma = rng.uniform(0.01, 0.02, len(points))
-    node, height, longer, rows = CHART.lay(points, sigma, motion, (0.5, 0.04))
+    node, height, longer, rows = CHART.lay(points, sigma, motion.terms, (0.5, 0.04))
     back = motion.undo(points)
     foot = CHART.project(back)
     three = np.minimum(np.searchsorted(CHART.z_mm[2::2], points[:, 2], side="right"), 3)

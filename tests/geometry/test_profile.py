@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from geometry.errors import BadInput, CannotMeasure
-from geometry.sections.chart import NODES, SectionSettings, find_motion, outward_normals, unroll
+from geometry.sections.chart import NODES, SectionSettings, outward_normals, unroll
+from geometry.sections.motion import find_motion
 from geometry.sections.profile import Gap, Scan, find_gaps, reconstruct
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part
 
