@@ -6,6 +6,8 @@ First table: blades cut exactly, 0.012 mm noise; 60 points a square millimetre a
 every 5th and every 20th of its points. U = 2 sigma. Second: hollows with smooth rims beside a broken corner;
 `width` in point spacings. Found is the share of the hollows with a damage of their own; recall the share of
 the points that truly lie deeper than 5 sigmas of noise, false that of the sound points told to lie on damage.
+Third: losses of tip and edges as deep as their detection limits, or a part of them; strange is what else is
+told.
 """
 
 import sys
@@ -20,6 +22,7 @@ from tests.geometry.airfoils import cloud_of
 from tests.geometry.poses import in_place
 from tests.geometry.test_damage_depth import CUTTERS, DENSITIES, NOISE_MM, number, one, truth
 from tests.geometry.test_damage_detection import centres_of
+from tests.geometry.test_damage_limits import found_at
 from tests.geometry.test_twin import nominal
 
 HOLLOWS = (  # depth in detection limits, width in spacings, pitch, noise
@@ -75,12 +78,28 @@ def hollows(limits: float, spacings: float, pitch_mm: float, noise_mm: float, se
     )
 
 
+def limits(shares: float, per_mm2: float, noise_mm: float, seeds: int) -> None:
+    """One line: losses of tip and edges as deep as so many of their limits, and the share that is found."""
+    rows = [found_at(shares, per_mm2, noise_mm, seed) for seed in range(seeds)]
+    for zone in (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE):
+        hits = np.concatenate([found[zone] for _, found, _ in rows])
+        print(f"{zone:14} {shares:5.1f} {per_mm2:8.0f} {noise_mm:7.3f} {rows[0][0][zone]:7.3f} ", end="")
+        print(
+            f"{100 * hits.mean():8.1f} of {len(hits):3d} {sum(strange for _, _, strange in rows):8d}",
+            flush=True,
+        )
+
+
 def main(seeds: int) -> None:
     print(f"noise {NOISE_MM} mm")
     depths(seeds)
     print("\n  depth  limits   width   pitch   noise  found % recall %  false %")
     for row in HOLLOWS:
         hollows(*row, seeds)
+    print(f"\n{'loss':14} {'of':>5} {'per mm2':>8} {'noise':>7} {'depth':>7} {'found %':>8} {'strange':>15}")
+    for per_mm2, noise_mm in ((60.0, 0.01), (25.0, 0.01), (25.0, 0.05), (8.0, 0.02)):
+        for shares in (1.0, 0.6):
+            limits(shares, per_mm2, noise_mm, seeds)
 
 
 if __name__ == "__main__":

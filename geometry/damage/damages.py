@@ -2,15 +2,18 @@
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
 from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
-from geometry.damage.regions import Field, Region, RegionSettings, find_regions, stand_off
+from geometry.damage.detection import edge_limit_mm, tip_limit_mm
+from geometry.damage.regions import Field, Region, RegionSettings, find_regions, spacing_of, stand_off
 from geometry.deformation.twin import Twin
 from geometry.registration.register import Alignment
+from geometry.scan.neighbourhood import nearest_of
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone
 
 PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
@@ -84,34 +87,29 @@ def detection_limit(
 
     Stated for a hollow that runs out smoothly over `HOLLOW_SPACINGS`; a narrower one must be deeper. It is
     found when the mean over a neighbourhood, which flattens it, passes `high` sigmas; it must exceed that by
-    the quantile of the noise of one such mean. At a tip or an edge the loss must also reach past the spacing
-    of the points, for metal between two points is not seen to be missing.
+    the quantile of the noise of one such mean. Edges and a thin tip must lose more: their loss leaves a
+    narrow strip.
     """
+    if not twin.supported.any():
+        return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
     regions = settings.regions
     noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
     mean_mm = max(noise_mm / np.sqrt(regions.neighbours + 1), regions.floor_mm)
-    if not twin.supported.any():
-        return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
     sigma_mm = float(np.hypot(mean_mm, np.quantile(twin.sigma_mm[twin.supported], 0.95)))
-    normal_mm = (regions.high + PROBABLE) * sigma_mm / KEPT
-    spacing_mm = _spacing_mm(cloud)
-    along_mm = {Zone.TIP: spacing_mm, Zone.LEADING_EDGE: spacing_mm, Zone.TRAILING_EDGE: spacing_mm}
-    return {
-        zone: Measurand(
-            name=f"{zone}_detection",
-            value=float(np.hypot(normal_mm, along_mm.get(zone, 0.0))),
-            sigma=0.0,
-            unit="mm",
-        )
-        for zone in PRECEDENCE
-    }
+    hollow_mm = (regions.high + PROBABLE) * sigma_mm / KEPT
+    neighbours = nearest_of(cloud, min(regions.neighbours + 1, len(cloud)))
+    spacing_mm = spacing_of(cloud, neighbours)
+    across_mm = spacing_mm * float(np.sqrt(neighbours.shape[1] * 4.0 / np.pi))
+    edge_mm = edge_limit_mm(twin, hollow_mm, across_mm)
+    tip_mm = tip_limit_mm(twin, hollow_mm, across_mm, HOLLOW_SPACINGS * spacing_mm)
+    limits_mm = (tip_mm, edge_mm, edge_mm, hollow_mm)
+    return {zone: _limit(zone, limit_mm) for zone, limit_mm in zip(PRECEDENCE, limits_mm, strict=True)}
 
 
-def _spacing_mm(cloud: Cloud) -> float:
-    """Spacing of neighbouring points of the cloud."""
-    few = cloud.points_mm[:: max(1, len(cloud) // 5000)]
-    distance_mm = np.asarray(cKDTree(cloud.points_mm).query(few, 9)[0])
-    return float(np.median(distance_mm[:, -1]) * np.sqrt(np.pi / 8.0))
+def _limit(zone: Zone, value_mm: float) -> Measured:
+    if not np.isfinite(value_mm):
+        return NotMeasured(reason="no loss of an edge would show")
+    return Measurand(name=f"{zone}_detection", value=value_mm, sigma=0.0, unit="mm")
 
 
 def _bent_pairs(
@@ -187,21 +185,21 @@ def _above_root(lowest: Measured, nominal: Nominal) -> Measured:
 
 
 def _spaced(damages: list[Damage], found: Field) -> tuple[Damage, ...]:
-    """The damages, each with its distance to the nearest other one."""
+    """The damages, each with its distance to the nearest other one; borders are known to half a spacing."""
     if len(damages) < 2:
         return tuple(damages)
     trees = [cKDTree(found.scan_mm[damage.points]) for damage in damages]
+    apart_mm = np.full((len(damages),) * 2, np.inf)
+    for i, j in combinations(range(len(damages)), 2):
+        few, many = sorted((trees[i], trees[j]), key=lambda tree: int(tree.n))
+        apart_mm[i, j] = apart_mm[j, i] = np.min(many.query(few.data)[0])
+    sigma_mm = float(found.spacing_mm / np.sqrt(6.0))
     return tuple(
-        replace(damage, spacing_mm=_spacing(own, [tree for tree in trees if tree is not own], found))
-        for damage, own in zip(damages, trees, strict=True)
+        replace(
+            damage, spacing_mm=Measurand(name="spacing", value=float(nearest_mm), sigma=sigma_mm, unit="mm")
+        )
+        for damage, nearest_mm in zip(damages, apart_mm.min(axis=1), strict=True)
     )
-
-
-def _spacing(own: cKDTree, others: list[cKDTree], found: Field) -> Measurand:
-    """Distance to the nearest of the other damages; both borders lie within half a point spacing."""
-    apart_mm = min(float(np.min(own.query(other.data)[0])) for other in others)
-    sigma_mm = found.spacing_mm / np.sqrt(6.0)
-    return Measurand(name="spacing", value=apart_mm, sigma=float(sigma_mm), unit="mm")
 
 
 def _bent(
