@@ -100,6 +100,13 @@ def solid_normals(mesh: Mesh) -> Normals:
     return Normals(face=face, corner=_unit(corner).reshape(-1, 3, 3), edge=edge, vertex=vertex)
 
 
+def facet_bulge_mm(mesh: Mesh, corner_normals: Floats) -> Floats:
+    """Mean height (faces,) of a smooth surface through the corners, with their normals, over each facet."""
+    corners_mm = mesh.vertices_mm[mesh.faces]
+    edges_mm, turns = (np.roll(values, -1, axis=1) - values for values in (corners_mm, corner_normals))
+    return np.asarray(np.sum(edges_mm * turns, axis=(1, 2)) / 24.0)
+
+
 def _mates(mesh: Mesh) -> Ints:
     """For the edge that starts at each corner (m, 3), the corner number 3 f + c of its twin next door."""
     start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from geometry.blade.nominal import Nominal
-from geometry.blade.solid import face_areas_mm2, solid_normals
+from geometry.blade.solid import face_areas_mm2, facet_bulge_mm, solid_normals
 from geometry.deformation.freeform import Lattice, lattice_over
 from geometry.deformation.offset import Nodes, Plate, plate_over, scatter_nodes
 from geometry.deformation.refine import Refined, refine
@@ -54,7 +54,7 @@ def prepare_ground(nominal: Nominal, nodes: int, cells: int) -> Ground:
         lattice=lattice,
         refined=refined,
         plate=plate_over(fine),
-        bulge_mm=_bulge_mm(nominal, corners)[nominal.closest(fine.points_mm).face],
+        bulge_mm=facet_bulge_mm(nominal.mesh, corners)[nominal.closest(fine.points_mm).face],
         graph=fine.graph(),
         coarse=coarse,
         from_coarse=coarse.interpolation(fine.points_mm, fine.normals),
@@ -62,13 +62,6 @@ def prepare_ground(nominal: Nominal, nodes: int, cells: int) -> Ground:
         side_normals=normals,
         to_sides=fine.interpolation(refined.mesh.vertices_mm[vertex], normals),
     )
-
-
-def _bulge_mm(nominal: Nominal, corner_normals: Floats) -> Floats:
-    """Mean height (faces,) of a smooth surface through the corners with their normals over each facet."""
-    corners_mm = nominal.mesh.vertices_mm[nominal.mesh.faces]
-    edges_mm, turns = (np.roll(values, -1, axis=1) - values for values in (corners_mm, corner_normals))
-    return np.asarray(np.sum(edges_mm * turns, axis=(1, 2)) / 24.0)
 
 
 def _scatter(nominal: Nominal, refined: Refined, wanted: int) -> Nodes:

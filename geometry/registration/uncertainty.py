@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from geometry.blade.nominal import UP, Closest, Nominal
-from geometry.blade.solid import solid_normals
+from geometry.blade.solid import facet_bulge_mm, solid_normals
 from geometry.blade.span import on_line_mm
 from geometry.registration.fit import every, motions, unit_motions
 from geometry.types import Bools, Floats
@@ -110,10 +110,7 @@ def _fall(power: Floats, seen: Floats, frequency: Floats, noise: float) -> float
 
 @lru_cache(maxsize=4)
 def _bulge_mm(nominal: Nominal) -> Floats:
-    """How far (faces,) a smooth surface through the corners with their normals stands over each facet."""
-    corners_mm, normals = nominal.mesh.vertices_mm[nominal.mesh.faces], solid_normals(nominal.mesh).corner
-    edges_mm, turns = (np.roll(values, -1, axis=1) - values for values in (corners_mm, normals))
-    return np.asarray(np.sum(edges_mm * turns, axis=(1, 2)) / 24.0)
+    return facet_bulge_mm(nominal.mesh, solid_normals(nominal.mesh).corner)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
