@@ -26,10 +26,9 @@ from simulators.blade import Wear
 from simulators.damage_solids import Cut, edge_nick, pit, tip_corner
 from simulators.optics import OpticsSettings
 from simulators.parts import SimPart, assemble
-from simulators.presets import nominal_blade, rig_of, serial_of
-from simulators.recipe import write_plan
-from simulators.solids import Floats, NotASolid, write_point_ply
-from simulators.synth import MAX_GAP_MM, largest_gap_mm, merged_scan
+from simulators.presets import nominal_blade, serial_of
+from simulators.solids import NotASolid
+from simulators.synth import write_scanned
 from simulators.wear import NominalBlade, WornBlade, worn_blade
 from station.inspect import inspect_scan
 
@@ -111,9 +110,7 @@ def logarithmic(rng: np.random.Generator, least: float, most: float) -> float:
 def judged(blade: NominalBlade, seed: int, folder: Path) -> Judged:
     """The part of a seed, inspected from its files in `folder`."""
     part = random_part(blade, seed)
-    scan_mm = merged_scan(part, rig_of(blade, seed), VIEWS, seed)
-    write_plan(folder, blade)
-    write_point_ply(folder / "scan.ply", scan_mm)
+    truth = write_scanned(folder, blade, part, VIEWS, seed)
     started_s = time.process_time()
     inspection = inspect_scan(
         folder / "plan.toml",
@@ -125,18 +122,13 @@ def judged(blade: NominalBlade, seed: int, folder: Path) -> Judged:
     )
     return Judged(
         seed=seed,
-        truth=truth_of(part, blade, scan_mm),
+        truth=truth["verdict"],
         word=str(inspection.verdict.verdict),
         reasons=inspection.verdict.reasons,
         clear=clearance(part),
-        removed_mm3=sum(damage.volume_mm3 for damage in part.damages),
+        removed_mm3=truth["removed_mm3"],
         seconds=time.process_time() - started_s,
     )
-
-
-def truth_of(part: SimPart, blade: NominalBlade, scan_mm: Floats) -> str:
-    hidden = largest_gap_mm(part.solid, blade, scan_mm, part.T_table_part) > MAX_GAP_MM
-    return str(part.truth_when(hidden=hidden)["verdict"])
 
 
 def clearance(part: SimPart) -> float:

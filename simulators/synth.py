@@ -107,13 +107,16 @@ def _order(options: argparse.Namespace) -> Order:
 
 def synthesise(folder: Path, blade: NominalBlade, order: Order) -> dict[str, Any]:
     """Make the part, scan it, write the four files into `folder`; returns the truth."""
-    part = ordered_part(blade, order)
-    rig = rig_of(blade, order.seed)
-    scan = merged_scan(part, rig, order.views, order.seed)
+    return write_scanned(folder, blade, ordered_part(blade, order), order.views, order.seed)
+
+
+def write_scanned(folder: Path, blade: NominalBlade, part: SimPart, views: int, seed: int) -> dict[str, Any]:
+    """Scan the part and write the four files into `folder`; returns the truth."""
+    scan = merged_scan(part, rig_of(blade, seed), views, seed)
     gap_mm = largest_gap_mm(part.solid, blade, scan, part.T_table_part)
     truth = part.truth_when(hidden=gap_mm > MAX_GAP_MM)
-    truth |= {"largest_gap_mm": gap_mm, "views": order.views, "points": len(scan)}
-    write_plan(folder, blade, sigma_mm=max(SIGMA_MM, order.noise_mm))
+    truth |= {"largest_gap_mm": gap_mm, "views": views, "points": len(scan)}
+    write_plan(folder, blade, sigma_mm=max(SIGMA_MM, part.optics.noise_normal_mm))
     write_point_ply(folder / "scan.ply", scan)
     text = json.dumps(truth, indent=1, allow_nan=False)
     (folder / "truth.json").write_text(text + "\n", encoding="utf-8")

@@ -3,6 +3,7 @@
 import ctypes
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -14,8 +15,10 @@ from geometry.blade import outline as outlines
 from geometry.blade.outline import End, Outline
 from geometry.blade.scatter import even_points
 from geometry.blade.solid import (
+    Normals,
     check_solid,
     faces_around,
+    facet_bulge_mm,
     merge_vertices,
     slice_loops,
     solid_normals,
@@ -115,10 +118,11 @@ class Nominal:
     shell_normals: Floats  # (s, 3)
     pivot_mm: Floats  # (3,) middle of the required surface
     gyration_mm: float  # its root mean square distance from there
+    mesh_normals: Normals  # of faces, corners and vertices
 
     def __init__(self, mesh: Mesh, settings: NominalSettings) -> None:
         self.mesh, self.settings = mesh, settings
-        self._normals = solid_normals(mesh)
+        self.mesh_normals = solid_normals(mesh)
         self._ring = faces_around(mesh)
         self._centre_mm = mesh.vertices_mm.mean(axis=0)
         self._scene = _ray_scene(mesh.vertices_mm - self._centre_mm, mesh.faces)
@@ -136,6 +140,11 @@ class Nominal:
         self.gyration_mm = float(
             np.sqrt(np.sum((self.samples.points_mm - self.pivot_mm) ** 2, axis=1).mean())
         )
+
+    @cached_property
+    def bulge_mm(self) -> Floats:
+        """How far (faces,) a smooth surface stands over each facet, on the mean."""
+        return facet_bulge_mm(self.mesh, self.mesh_normals.corner)
 
     def closest(self, points_mm: Floats) -> Closest:
         """The nearest point of the mesh to each point (n, 3).
@@ -159,7 +168,7 @@ class Nominal:
 
     def _feet(self, points_mm: Floats, near_face: Ints) -> tuple[Floats, Floats, Floats, Ints]:
         """Feet, normals, signed distances and faces of the nearest points, from a face near each."""
-        mesh, normals = self.mesh, self._normals
+        mesh, normals = self.mesh, self.mesh_normals
         shape = (points_mm, mesh.vertices_mm, mesh.faces)
         face, weights = refine_closest(*shape, near_face, *self._ring)
         feet_mm, smooth, distance_mm = describe_feet(
@@ -193,7 +202,7 @@ class Nominal:
 
         Raises `BadInput` where the plane misses the mesh.
         """
-        loops = slice_loops(self.mesh, self._normals.corner, self._below_tip(z_mm))
+        loops = slice_loops(self.mesh, self.mesh_normals.corner, self._below_tip(z_mm))
         if not loops:
             raise BadInput(f"section at z = {z_mm:g} mm: outside the nominal")
         loop = max(loops, key=lambda one: outlines.area(one.points_mm))
@@ -259,13 +268,13 @@ class Nominal:
             return np.zeros(len(self.mesh.faces), np.bool_)
         lowest_mm = self.mesh.vertices_mm[self.mesh.faces, 2].min(axis=1)
         return np.asarray(
-            (self._normals.face[:, 2] > UP) & (lowest_mm >= self.tip_z_mm - self.settings.tip_mm)
+            (self.mesh_normals.face[:, 2] > UP) & (lowest_mm >= self.tip_z_mm - self.settings.tip_mm)
         )
 
     def _end_faces(self) -> Bools:
         highest_mm = self.mesh.vertices_mm[self.mesh.faces, 2].max(axis=1)
         slack_mm = SPAN_SLACK * (self.tip_z_mm - self._bottom_mm)
-        return np.asarray((self._normals.face[:, 2] < -UP) & (highest_mm <= self._bottom_mm + slack_mm))
+        return np.asarray((self.mesh_normals.face[:, 2] < -UP) & (highest_mm <= self._bottom_mm + slack_mm))
 
     def _airfoil_faces(self) -> Bools:
         """Faces that reach into the span, without end faces: those at z_min and at a z_max below the tip."""

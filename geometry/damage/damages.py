@@ -10,7 +10,15 @@ from scipy.spatial import cKDTree
 from geometry.blade.nominal import ZONE_ORDER, Nominal
 from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
 from geometry.damage.detection import edge_limit_mm, tip_limit_mm
-from geometry.damage.regions import Field, Region, RegionSettings, find_regions, spacing_of, stand_off
+from geometry.damage.regions import (
+    Field,
+    Region,
+    RegionSettings,
+    find_regions,
+    noise_of,
+    spacing_of,
+    stand_off,
+)
 from geometry.deformation.twin import Twin
 from geometry.registration.register import Alignment
 from geometry.scan.neighbourhood import nearest_of
@@ -93,8 +101,7 @@ def detection_limit(
     if not twin.supported.any():
         return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
     regions = settings.regions
-    noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
-    mean_mm = max(noise_mm / np.sqrt(regions.neighbours + 1), regions.floor_mm)
+    mean_mm = max(noise_of(cloud, twin) / np.sqrt(regions.neighbours + 1), regions.floor_mm)
     sigma_mm = float(np.hypot(mean_mm, np.quantile(twin.sigma_mm[twin.supported], 0.95)))
     hollow_mm = (regions.high + PROBABLE) * sigma_mm / KEPT
     neighbours = nearest_of(cloud, min(regions.neighbours + 1, len(cloud)))

@@ -77,7 +77,7 @@ def stand_off(
     neighbours = nearest_of(cloud, min(settings.neighbours + 1, len(cloud)))
     distance_mm, _, face = skin_of(twin.mesh).closest(scan_mm)
     twin_sigma_mm = twin.sigma_mm[twin.mesh.faces[face]].mean(axis=1)
-    noise_mm = max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
+    noise_mm = noise_of(cloud, twin)
     mean_sigma_mm = noise_mm / np.sqrt(neighbours.shape[1])
     return Field(
         scan_mm=scan_mm,
@@ -90,6 +90,11 @@ def stand_off(
         on_airfoil=nominal.airfoil_face[twin.nominal_face[face]],
         skin_mm=_on_twin(nominal, twin),
     )
+
+
+def noise_of(cloud: Cloud, twin: Twin) -> float:
+    """Noise (mm) of a single point: what the sound ones show, and no less than a third of what is stated."""
+    return max(twin.noise_mm, float(np.median(cloud.sigma_mm)) / 3.0)
 
 
 def spacing_of(cloud: Cloud, neighbours: Ints) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from geometry.blade.nominal import Nominal
-from geometry.blade.solid import face_areas_mm2, facet_bulge_mm, solid_normals
+from geometry.blade.solid import face_areas_mm2
 from geometry.deformation.freeform import Lattice, lattice_over
 from geometry.deformation.offset import Nodes, Plate, plate_over, scatter_nodes
 from geometry.deformation.refine import Refined, refine
@@ -44,8 +44,9 @@ class Ground:
 def prepare_ground(nominal: Nominal, nodes: int, cells: int) -> Ground:
     """The ground with about so many nodes and cells of the lattice, kept from one part to the next."""
     lattice = lattice_over(nominal.samples.points_mm, cells)
-    corners = solid_normals(nominal.mesh).corner
-    refined = refine(nominal.mesh, corners, nominal.airfoil_face, EDGE_CELLS * lattice.cell_mm)
+    refined = refine(
+        nominal.mesh, nominal.mesh_normals.corner, nominal.airfoil_face, EDGE_CELLS * lattice.cell_mm
+    )
     fine = _scatter(nominal, refined, nodes)
     coarse = scatter_nodes(fine.points_mm, fine.normals, 1.0, COARSER * fine.spacing_mm)
     vertex, normals = refined.sides(CREASE_COSINE)
@@ -54,7 +55,7 @@ def prepare_ground(nominal: Nominal, nodes: int, cells: int) -> Ground:
         lattice=lattice,
         refined=refined,
         plate=plate_over(fine),
-        bulge_mm=facet_bulge_mm(nominal.mesh, corners)[nominal.closest(fine.points_mm).face],
+        bulge_mm=nominal.bulge_mm[nominal.closest(fine.points_mm).face],
         graph=fine.graph(),
         coarse=coarse,
         from_coarse=coarse.interpolation(fine.points_mm, fine.normals),

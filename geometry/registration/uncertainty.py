@@ -1,13 +1,11 @@
 """How far the form of the part, which no noise averages away, may have moved its pose."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from geometry.blade.nominal import UP, Closest, Nominal
-from geometry.blade.solid import facet_bulge_mm, solid_normals
 from geometry.blade.span import on_line_mm
 from geometry.registration.fit import every, motions, unit_motions
 from geometry.types import Bools, Floats
@@ -45,7 +43,7 @@ def form_covariance(nominal: Nominal, moved_mm: Floats, found: Closest) -> Float
     spread = np.zeros((6, 6))
     for shape, chordwise, spanwise in _patterns(nominal, feet_mm, normals):
         spread += _leaked(left_mm * shape, pose * shape[:, None], chordwise, spanwise)
-    bulge = pose.T @ _bulge_mm(nominal)[found.face[few]]
+    bulge = pose.T @ nominal.bulge_mm[found.face[few]]
     spread += np.outer(bulge, bulge)
     back = whiten * scale[:, None]
     return np.asarray(back @ spread @ back.T)
@@ -106,11 +104,6 @@ def _fall(power: Floats, seen: Floats, frequency: Floats, noise: float) -> float
     sizes = [power[band].sum() / max(float(seen[band].sum()), 1e-3) - noise for band in (long_, short)]
     ratio = max(sizes[0], 0.05 * noise) / max(sizes[1], 0.05 * noise, 1e-18)
     return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(middle / low), *STEEP))
-
-
-@lru_cache(maxsize=4)
-def _bulge_mm(nominal: Nominal) -> Floats:
-    return facet_bulge_mm(nominal.mesh, solid_normals(nominal.mesh).corner)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

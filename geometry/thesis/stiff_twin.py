@@ -128,7 +128,7 @@ def _doubt(beyond_mm: Floats, nodes: Nodes, matched: Matched, seen: Bools) -> Fl
 def _carry(ground: Ground, matched: Matched, nominal: Nominal) -> tuple[Refined, Floats]:
     """The nominal with long edges halved, and the displacement (vertices, 3) of the nodes on it."""
     longest_mm = max(2.0 * ground.pitch_mm, LEAST_EDGE_MM)
-    refined = refine(nominal.mesh, solid_normals(nominal.mesh).corner, nominal.airfoil_face, longest_mm)
+    refined = refine(nominal.mesh, nominal.mesh_normals.corner, nominal.airfoil_face, longest_mm)
     moves_mm = matched.moved_mm - ground.nodes.points_mm
     return refined, _at_vertices(refined.mesh, ground.nodes, moves_mm)
 
