@@ -36,7 +36,7 @@ from geometry.sections.curve import (
     thickness,
 )
 from geometry.sections.measurands import define, form, place, shape
-from geometry.sections.profile import Scan, reconstruct
+from geometry.sections.profile import reconstruct
 from geometry.types import Floats, Measurand
 from tests.geometry.airfoils import (
     AnalyticNominal,
@@ -46,6 +46,7 @@ from tests.geometry.airfoils import (
     alignment,
     cloud_of,
     random_airfoil,
+    scan_in_place,
     section_of,
 )
 
@@ -133,8 +134,7 @@ def one(
     settings = SectionSettings()
     chart = unroll(nominal, z, settings.widest_band_mm, settings)
     points = part.scan(rng, float(chart.z_mm[0]), float(chart.z_mm[-1]), spacing, noise)
-    count = len(points)
-    scan = Scan(points_mm=points, sigma_mm=np.full(count, noise), mask=np.zeros(count, bool))
+    scan = scan_in_place(points, noise)
     start = time.process_time()
     profile = reconstruct(scan, chart, settings)
     seconds = time.process_time() - start

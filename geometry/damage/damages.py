@@ -22,6 +22,7 @@ from geometry.damage.regions import (
 from geometry.deformation.twin import Twin
 from geometry.registration.register import Alignment
 from geometry.scan.neighbourhood import nearest_of
+from geometry.threads import one_blas_thread
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone
 
 PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
@@ -66,6 +67,7 @@ class DamageSettings:
     beside_mm: float = 6.0  # how near those sides lie: about the thickness of an airfoil
 
 
+@one_blas_thread
 def find_damages(
     cloud: Cloud,
     mask: Bools,

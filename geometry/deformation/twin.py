@@ -15,6 +15,7 @@ from geometry.errors import CannotFitTwin
 from geometry.registration.register import Alignment
 from geometry.robust import TUKEY, biweight, spread
 from geometry.scan.surface import near_each_other
+from geometry.threads import one_blas_thread
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh
 
@@ -66,6 +67,7 @@ class Twin:
     converged: bool
 
 
+@one_blas_thread
 def fit_twin(
     cloud: Cloud, mask: Bools, alignment: Alignment, nominal: Nominal, settings: TwinSettings
 ) -> Twin:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from geometry.types import Bools, Floats, Ints
+from geometry.types import Floats, Ints
 
 
 @njit(cache=True, nogil=True)
@@ -252,25 +252,3 @@ def lay(
             rows[used, 5] = height
             used += 1
     return node[:used], heights_mm[:used], sigmas_mm[:used], rows[:used]
-
-
-@njit(cache=True, nogil=True)
-def sort_by_height(z_mm: Floats, mask: Bools, low_mm: float, step_mm: float, bins: int) -> tuple[Ints, Ints]:
-    """The numbers of the points that `mask` does not mark, bin by bin upward, and where each bin begins.
-
-    Bin b holds the heights from `low_mm` + b `step_mm` on; in a bin the points keep their order. Returns
-    (k,) and (bins + 1,).
-    """
-    start = np.zeros(bins + 1, np.int64)
-    for i in range(len(z_mm)):
-        if not mask[i]:
-            start[min(int((z_mm[i] - low_mm) / step_mm), bins - 1) + 1] += 1
-    for b in range(bins):
-        start[b + 1] += start[b]
-    order, place = np.empty(start[bins], np.int64), start.copy()
-    for i in range(len(z_mm)):
-        if not mask[i]:
-            b = min(int((z_mm[i] - low_mm) / step_mm), bins - 1)
-            order[place[b]] = i
-            place[b] += 1
-    return order, start

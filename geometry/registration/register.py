@@ -26,6 +26,7 @@ from geometry.registration.slide import LEAST, slides_mm
 from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
 from geometry.robust import robust_sigma
 from geometry.scan.neighbourhood import nearest_of
+from geometry.threads import one_blas_thread
 from geometry.transforms import apply, exp, inverse
 from geometry.types import Bools, Cloud, Floats, Ints
 
@@ -78,6 +79,7 @@ class RegisterSettings:
             raise BadInput(f"register: {self} has a distance that is none")
 
 
+@one_blas_thread
 def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = RegisterSettings()) -> Alignment:
     """The pose of the scan on the nominal.
 
@@ -286,6 +288,7 @@ def _won(places: list[Settled]) -> bool:
     return all(gain >= 2 * int(r.kept.sum() - first.kept.sum()) for r in rivals)
 
 
+@one_blas_thread
 def mask_damage(
     cloud: Cloud,
     alignment: Alignment,

@@ -19,6 +19,7 @@ from geometry.repair.border import border_of
 from geometry.repair.columns import volume_by_columns
 from geometry.repair.cut_body import Reach, cut_body
 from geometry.repair.lost_piece import Piece, lost_piece, solid_of
+from geometry.threads import one_blas_thread
 from geometry.transforms import apply, check_rigid, inverse
 from geometry.types import Bools, Cloud, Floats, Measurand, Measured, Mesh, NotMeasured, Zone
 
@@ -92,6 +93,7 @@ class RepairVolume:
     failures: dict[int, str]
 
 
+@one_blas_thread
 def find_repairs(
     twin: Twin, cloud: Cloud, alignment: Alignment, damages: Sequence[Damage], settings: RepairSettings
 ) -> RepairVolume:

@@ -23,9 +23,10 @@ from geometry.sections.profile import (
     cover_zones,
     explain_gaps,
     reconstruct,
+    scan_of,
     whole_gap,
 )
-from geometry.transforms import apply
+from geometry.threads import one_blas_thread
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured
 
 __all__ = [
@@ -93,6 +94,7 @@ class Section:
     band_points: int = 0
 
 
+@one_blas_thread
 def measure_sections(
     cloud: Cloud,
     mask: Bools,
@@ -106,9 +108,7 @@ def measure_sections(
     `mask` (n,): True = a damaged point. Sigmas hold the noise found about the profile, the number of
     points, the smoothness assumed between them, and the pose.
     """
-    scan = Scan(
-        points_mm=apply(alignment.T_nominal_scan, cloud.points_mm), sigma_mm=cloud.sigma_mm, mask=mask
-    )
+    scan = scan_of(cloud, mask, alignment.T_nominal_scan)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         return tuple(pool.map(lambda z: _measure(scan, alignment, nominal, float(z), settings), z_mm))
 

@@ -5,13 +5,11 @@ normals (`geometry.sections.band`). What has no points is a gap, never bridged.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from geometry.blade.nominal import Nominal
 from geometry.errors import CannotMeasure
-from geometry.kernels.profile import sort_by_height
 from geometry.kernels.profile_spline import SplineFit
 from geometry.kernels.tensor_spline import cubic_weights
 from geometry.sections.band import Knots, band_of, onto_chart, robust_fit
@@ -24,9 +22,8 @@ from geometry.sections.chart import (
     unroll,
 )
 from geometry.sections.motion import Motion, find_motion, rigid_columns
-from geometry.types import Bools, Floats, Ints
-
-_BIN_MM, _MOST_BINS = 0.25, 1 << 16  # of height, in which points are found
+from geometry.transforms import apply
+from geometry.types import Bools, Cloud, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,31 +94,28 @@ class Profile:
         return self.chart.section_z_mm
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scan:
-    """The scan points in the nominal frame."""
+    """A scan, taken into the nominal frame where a section asks for it."""
 
-    points_mm: Floats  # (n, 3)
-    sigma_mm: Floats  # (n,)
+    cloud: Cloud
     mask: Bools  # (n,) True = damaged
+    T_nominal_scan: Floats
+    z_mm: Floats  # (n,) heights in the nominal frame
 
-    def between(self, low_mm: float, high_mm: float) -> tuple[Ints, Floats]:
-        """Numbers and heights of the sound points from one height to another, and of some just outside."""
-        order, z_mm, start, low, step = self._upward
-        bins = len(start) - 1
-        first, last = (int(np.clip((z - low) / step, 0.0, bins - 1.0)) for z in (low_mm, high_mm))
-        inside = slice(start[first], start[last + 1])
-        return order[inside], z_mm[inside]
+    def between(self, low_mm: float, high_mm: float) -> Ints:
+        """Numbers of the points from one height to another, both included."""
+        return np.flatnonzero((self.z_mm >= low_mm) & (self.z_mm <= high_mm))
 
-    @cached_property
-    def _upward(self) -> tuple[Ints, Floats, Ints, float, float]:
-        """The sound points sorted into bins of height, their heights, where each bin begins, the first
-        height, the step."""
-        z = np.ascontiguousarray(self.points_mm[:, 2])
-        low, high = float(z.min(initial=0.0)), float(z.max(initial=0.0))
-        step = max(_BIN_MM, (high - low) / _MOST_BINS)
-        order, start = sort_by_height(z, self.mask, low, step, int((high - low) / step) + 1)
-        return order, z[order], start, low, step
+    def points_mm(self, numbers: Ints) -> Floats:
+        """These points (k, 3), nominal frame."""
+        return apply(self.T_nominal_scan, self.cloud.points_mm.take(numbers, axis=0))
+
+
+def scan_of(cloud: Cloud, mask: Bools, T_nominal_scan: Floats) -> Scan:
+    """A cloud as sections are cut from it."""
+    z_mm = cloud.points_mm @ T_nominal_scan[2, :3] + T_nominal_scan[2, 3]
+    return Scan(cloud=cloud, mask=mask, T_nominal_scan=T_nominal_scan, z_mm=z_mm)
 
 
 def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
@@ -129,14 +123,16 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
 
     Raises `CannotMeasure` when too few sound points lie near the plane.
     """
-    near, z = scan.between(float(chart.z_mm[0]), float(chart.z_mm[-1]))
+    near = scan.between(float(chart.z_mm[0]), float(chart.z_mm[-1]))
+    near = near[~scan.mask.take(near)]
+    z = scan.z_mm.take(near)
     low, high = band_of(chart, z, settings)
     inside = near[(z >= low) & (z <= high)]
     if len(inside) < settings.min_points:
         raise CannotMeasure(f"no sound points within {settings.band_mm:g} mm of the plane")
-    sound = scan.points_mm.take(inside, axis=0)
+    sound = scan.points_mm(inside)
     motion = find_motion(chart, sound)
-    band = onto_chart(sound, scan.sigma_mm.take(inside), chart, motion, settings)
+    band = onto_chart(sound, scan.cloud.sigma_mm.take(inside), chart, motion, settings)
     if len(band.node) < settings.min_points:
         raise CannotMeasure("no sound points near the nominal section")
     keep, knots, fit = robust_fit(band, chart, (low, high), settings)
@@ -268,12 +264,11 @@ def explain_gaps(
     if not gaps or not scan.mask.any():
         return gaps
     chart = unroll(nominal, z_mm, settings.damage_reach_mm, settings)
-    z = scan.points_mm[:, 2]
-    inside = (z >= chart.z_mm[0]) & (z <= chart.z_mm[-1])
+    inside = scan.between(float(chart.z_mm[0]), float(chart.z_mm[-1]))
     around = Surroundings(
         perimeter_mm=chart.perimeter_mm,
-        arc_mm=chart.arc_at(chart.project(scan.points_mm[inside])[:, 0]),
-        height_mm=z[inside] - z_mm,
+        arc_mm=chart.arc_at(chart.project(scan.points_mm(inside))[:, 0]),
+        height_mm=scan.z_mm[inside] - z_mm,
         damaged=scan.mask[inside],
     )
     return tuple(replace(gap, in_damage=_in_damage(gap, around, settings.max_gap_mm)) for gap in gaps)

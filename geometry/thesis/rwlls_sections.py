@@ -18,9 +18,8 @@ from geometry.sections.curve import Estimate, node_shares
 from geometry.sections.form import share_beyond_sigma
 from geometry.sections.measurands import Definition, define, form, place, shape
 from geometry.sections.motion import find_motion
-from geometry.sections.profile import Gap, Scan, explain_gaps, find_gaps
+from geometry.sections.profile import Gap, Scan, explain_gaps, find_gaps, scan_of
 from geometry.thesis.rwlls_profile import ClosedProfile, RwllsSettings, reconstruct_thesis
-from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured
 
 _UNSTATED = ("le_min_radius_mm", "te_min_radius_mm")  # no sigma would hold: the spline undulates there
@@ -60,9 +59,7 @@ def measure_sections_thesis(
     `mask` (n,): True = a damaged point. Sigmas hold the noise found about the profile, propagated through
     domains and spline, what the local curves disagree by, and the pose.
     """
-    scan = Scan(
-        points_mm=apply(alignment.T_nominal_scan, cloud.points_mm), sigma_mm=cloud.sigma_mm, mask=mask
-    )
+    scan = scan_of(cloud, mask, alignment.T_nominal_scan)
     return tuple(_measure(scan, alignment, nominal, float(z), settings) for z in z_mm)
 
 
@@ -72,7 +69,7 @@ def _measure(
     """One section."""
     chart = unroll(nominal, z_mm, settings.near_mm, settings.sections)
     definition = define(chart.curve_mm, chart.side, settings.sections)
-    near = np.flatnonzero(np.abs(scan.points_mm[:, 2] - z_mm) <= settings.near_mm)
+    near = scan.between(z_mm - settings.near_mm, z_mm + settings.near_mm)
     try:
         points_mm, arc_mm = _sound_points(scan, near, chart, settings)
     except CannotMeasure as why:
@@ -85,7 +82,7 @@ def _measure(
     if scan.mask[near].any():
         return _lost(z_mm, definition, covered, NotMeasured(reason="damaged points lie on the profile"))
     try:
-        uncertainty_mm = float(np.median(scan.sigma_mm[near]))
+        uncertainty_mm = float(np.median(scan.cloud.sigma_mm[near]))
         profile = reconstruct_thesis(points_mm, z_mm, uncertainty_mm, settings.profile)
     except CannotMeasure as why:
         return _lost(z_mm, definition, covered, NotMeasured(reason=str(why)))
@@ -96,7 +93,7 @@ def _sound_points(
     scan: Scan, near: Ints, chart: Chart, settings: ThesisSectionSettings
 ) -> tuple[Floats, Floats]:
     """The undamaged points near plane and nominal section, and where on its arc they stand."""
-    sound = scan.points_mm[near[~scan.mask[near]]]
+    sound = scan.points_mm(near[~scan.mask[near]])
     if len(sound) < settings.profile.min_points:
         raise CannotMeasure(f"no sound points within {settings.near_mm:g} mm of the plane")
     foot = chart.project(find_motion(chart, sound).undo(sound))

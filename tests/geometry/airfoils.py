@@ -13,7 +13,8 @@ import numpy as np
 
 from geometry.blade.nominal import Nominal, NominalSection
 from geometry.registration.register import Alignment
-from geometry.types import Cloud, Floats, Ints
+from geometry.sections.profile import Scan, scan_of
+from geometry.types import Bools, Cloud, Floats, Ints
 from tests.geometry.poses import in_place
 
 
@@ -234,3 +235,9 @@ def alignment(
 def cloud_of(points_mm: Floats, sigma_mm: float) -> Cloud:
     count = len(points_mm)
     return Cloud(points_mm=points_mm, sigma_mm=np.full(count, sigma_mm), view=np.zeros(count, np.int64))
+
+
+def scan_in_place(points_mm: Floats, sigma_mm: float, mask: Bools | None = None) -> Scan:
+    """Points of the nominal frame as sections are cut from them; none is damaged unless told."""
+    mask = np.zeros(len(points_mm), bool) if mask is None else mask
+    return scan_of(cloud_of(points_mm, sigma_mm), mask, np.eye(4))

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from geometry.kernels.profile import nearest_nodes, sort_by_height
+from geometry.kernels.profile import nearest_nodes
 from geometry.kernels.profile_spline import curvature_penalty, gather, solve, stencil
 from geometry.kernels.tensor_spline import band_bins, band_misfit, tensor_values
 from geometry.sections.band import band_of
 from geometry.sections.chart import SectionSettings, curvature, outward_normals, unroll
 from geometry.sections.curve import centroid
 from geometry.sections.motion import Motion, rigid_columns
-from geometry.sections.profile import Scan, reconstruct
-from tests.geometry.airfoils import AnalyticNominal, Blade, Part
+from geometry.sections.profile import reconstruct
+from tests.geometry.airfoils import AnalyticNominal, Blade, Part, scan_in_place
 
 P, Q = 16, 5
 SETTINGS = SectionSettings()
@@ -159,17 +159,6 @@ def test_points_are_laid_as_motion_projection_and_steepness_say():
     assert_allclose(rows, np.hstack([foot[:, 1:2], arm, foot[:, 2:], over])[near], atol=1e-12)
 
 
-def test_heights_sorted_into_bins():
-    rng = np.random.default_rng(1)
-    z, mask = rng.uniform(-3.0, 8.0, 500), rng.random(500) < 0.3
-    order, start = sort_by_height(z, mask, -3.0, 0.5, 22)
-    assert sorted(order) == np.flatnonzero(~mask).tolist()
-    for b in range(22):
-        inside = order[start[b] : start[b + 1]]
-        assert (np.diff(inside) > 0).all()
-        assert ((z[inside] >= -3.0 + 0.5 * b) & (z[inside] < -2.5 + 0.5 * b)).all()
-
-
 def test_a_band_ends_where_its_chart_ends():
     chart = unroll(NOMINAL, 3.0, 12.0, SETTINGS)
     assert band_of(chart, np.empty(0), SETTINGS) == pytest.approx((0.0, 15.0))
@@ -186,10 +175,7 @@ def test_centroids_are_within_the_thesis_table_where_it_is_tightest():
     true = centroid(part.section(52.5))
     for seed in range(6):
         points = part.scan(np.random.default_rng(seed), 40.5, 64.5, 0.2, 0.010)
-        clear = np.zeros(len(points), bool)
-        profile = reconstruct(
-            Scan(points_mm=points, sigma_mm=np.full(len(points), 0.01), mask=clear), CHART, SETTINGS
-        )
+        profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)
         assert np.linalg.norm(centroid(profile.curve_mm) - true) < 0.000703
 
 
@@ -198,10 +184,6 @@ def test_the_motion_of_a_bent_blade_is_followed():
     rng = np.random.default_rng(7)
     points = Part().scan(rng, 40.5, 64.5, 0.15, 0.01)
     points[:, 1] += 3e-4 * (points[:, 2] - 30.0) ** 2
-    profile = reconstruct(
-        Scan(points_mm=points, sigma_mm=np.full(len(points), 0.01), mask=np.zeros(len(points), bool)),
-        CHART,
-        SETTINGS,
-    )
+    profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)
     true = centroid(Part().section(52.5)) + np.array([0.0, 3e-4 * 22.5**2])
     assert np.abs(centroid(profile.curve_mm) - true).max() < 0.0015

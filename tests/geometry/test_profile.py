@@ -9,21 +9,12 @@ from numpy.testing import assert_allclose
 from geometry.errors import BadInput, CannotMeasure
 from geometry.sections.chart import NODES, SectionSettings, outward_normals, unroll
 from geometry.sections.motion import find_motion
-from geometry.sections.profile import Gap, Scan, find_gaps, reconstruct
-from tests.geometry.airfoils import AnalyticNominal, Blade, Part
+from geometry.sections.profile import Gap, find_gaps, reconstruct
+from tests.geometry.airfoils import AnalyticNominal, Blade, Part, scan_in_place
 
 SETTINGS = SectionSettings()
 NOMINAL = AnalyticNominal(Blade())
 CHART = unroll(NOMINAL, 52.5, 6.0, SETTINGS)
-
-
-def scan_of(points, sigma_mm=0.01, mask=None):
-    count = len(points)
-    return Scan(
-        points_mm=points,
-        sigma_mm=np.full(count, sigma_mm),
-        mask=np.zeros(count, bool) if mask is None else mask,
-    )
 
 
 def lagrange_weights(at, x):
@@ -111,7 +102,7 @@ def test_a_noise_free_part_is_reconstructed_to_a_third_of_a_micrometre():
         turn_deg=0.1,
     )
     points = part.scan(np.random.default_rng(2), 46.5, 58.5, 0.25, 0.0)
-    profile = reconstruct(scan_of(points), CHART, SETTINGS)
+    profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)
     assert nearest_on_curve(profile.curve_mm[::13], part.section(52.5)).max() < 3e-4
     assert profile.gaps == ()
 
@@ -122,7 +113,7 @@ def test_leftover_outliers_do_not_move_the_profile():
     points = part.scan(rng, 46.5, 58.5, 0.2, 0.015)
     wild = rng.random(len(points)) < 0.03
     points[wild, :2] += rng.uniform(0.1, 0.6, (wild.sum(), 1)) * np.array([0.3, 0.9])
-    profile = reconstruct(scan_of(points), CHART, SETTINGS)
+    profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)
     assert nearest_on_curve(profile.curve_mm[::13], part.section(52.5)).max() < 0.003
 
 
@@ -134,14 +125,14 @@ def test_erosion_of_the_leading_edge_is_followed():
 
     part = Part(deviation=eroded)
     points = part.scan(np.random.default_rng(4), 46.5, 58.5, 0.15, 0.015)
-    profile = reconstruct(scan_of(points), CHART, SETTINGS)
+    profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)
     assert nearest_on_curve(profile.curve_mm[::7], part.section(52.5)).max() < 0.004
     assert profile.deviation_mm.min() == pytest.approx(-0.15, abs=0.004)
 
 
 def test_noise_is_found():
     points = Part().scan(np.random.default_rng(5), 46.5, 58.5, 0.2, 0.03)
-    profile = reconstruct(scan_of(points, sigma_mm=0.01), CHART, SETTINGS)
+    profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)
     assert profile.noise_mm == pytest.approx(0.03 / np.sqrt(3.0), rel=0.07)
 
 
@@ -149,7 +140,7 @@ def test_a_missing_stretch_is_a_gap_of_its_width():
     part = Part()
     points = part.scan(np.random.default_rng(6), 46.5, 58.5, 0.15, 0.01)
     arc = CHART.arc_at(CHART.project(points)[:, 0])
-    profile = reconstruct(scan_of(points[(arc < 20.0) | (arc > 25.0)]), CHART, SETTINGS)
+    profile = reconstruct(scan_in_place(points[(arc < 20.0) | (arc > 25.0)], 0.01), CHART, SETTINGS)
     (gap,) = profile.gaps
     assert gap.start_mm == pytest.approx(20.0, abs=0.2)
     assert gap.width_mm == pytest.approx(5.0, abs=0.3)
@@ -173,9 +164,9 @@ def test_no_points_are_one_gap():
 def test_too_few_points_raise():
     points = Part().scan(np.random.default_rng(7), 46.5, 58.5, 0.2, 0.01)
     with pytest.raises(CannotMeasure):
-        reconstruct(scan_of(points[:30]), CHART, SETTINGS)
+        reconstruct(scan_in_place(points[:30], 0.01), CHART, SETTINGS)
     with pytest.raises(CannotMeasure):
-        reconstruct(scan_of(points, mask=np.ones(len(points), bool)), CHART, SETTINGS)
+        reconstruct(scan_in_place(points, 0.01, mask=np.ones(len(points), bool)), CHART, SETTINGS)
 
 
 @settings(max_examples=60, deadline=None)
