@@ -15,7 +15,7 @@ from geometry.types import Floats, Measurand, Measured, Mesh, NotMeasured, Zone
 DEEP = 3.0  # sigmas below the twin at which a single point lies on the break for certain
 PLANE_POINTS = 12  # of the break, whose plane ends it
 PLANE_REACH = 3.0  # spacings that such a plane may be continued beyond them
-BORDER = 0.3  # standard uncertainty of where a break ends, in spacings of its points, at least
+BORDER = 0.5  # standard uncertainty of where a break ends, in spacings of its points, at least
 FRONT_POINTS = 30  # of the break about a height, whose quadric is the metal left there
 LEAST_FRONT = 10
 FRONT = 0.1  # standard uncertainty of that quadric between the points, in their spacings, at least
@@ -81,19 +81,30 @@ def lowest_mm(region: Region, found: Field, twin: Twin) -> Measured:
         return NotMeasured(reason=f"{len(break_mm)} points lie on the damage for certain")
     tree = cKDTree(break_mm)
     start = break_mm[int(np.argmin(break_mm[:, 2]))]
-    apart_mm, near = tree.query(start, PLANE_POINTS)
-    near_mm, weight = break_mm[near], (1.0 - (apart_mm / (1.1 * apart_mm[-1])) ** 2) ** 2
-    middle_mm = np.average(near_mm, axis=0, weights=weight)
-    normal = np.linalg.eigh(np.cov(near_mm.T, aweights=weight))[1][:, 0]
     reach_mm = PLANE_REACH * found.spacing_mm
-    rim_mm = _plane_section(twin, middle_mm, normal, start, 2.0 * reach_mm)
-    rim_mm = np.concatenate([start[None], rim_mm[tree.query(rim_mm)[0] <= reach_mm]])
-    end_mm = rim_mm[int(np.argmin(rim_mm[:, 2]))]
+    end_mm, scatter_mm = _end(tree, start, PLANE_POINTS, twin, reach_mm)
+    wider_mm, _ = _end(tree, start, 2 * PLANE_POINTS, twin, reach_mm)  # a bent break ends elsewhere
     bare_mm = _bare_mm(end_mm, found, 4.0 * reach_mm)
     border_mm = max(BORDER * found.spacing_mm, 0.5 * float(start[2] - end_mm[2]), 0.5 * bare_mm)
-    scatter_mm = float(np.sqrt(np.average(((near_mm - middle_mm) @ normal) ** 2, weights=weight)))
-    sigma_mm = float(np.linalg.norm([border_mm, scatter_mm, _sigma_mm(region, found)]))
+    bent_mm = float(wider_mm[2] - end_mm[2])
+    sigma_mm = float(np.linalg.norm([border_mm, scatter_mm, bent_mm, _sigma_mm(region, found)]))
     return Measurand(name="lowest", value=float(end_mm[2]) - 0.5 * bare_mm, sigma=sigma_mm, unit="mm")
+
+
+def _end(tree: cKDTree, start_mm: Floats, count: int, twin: Twin, reach_mm: float) -> tuple[Floats, float]:
+    """Where the plane through the `count` points of a break next to `start_mm` leaves the twin lowest, and
+    the scatter of these points about it.
+
+    It is continued no farther than `reach_mm` beyond the points of the break.
+    """
+    apart_mm, near = tree.query(start_mm, min(count, tree.n))
+    near_mm, weight = tree.data[near], (1.0 - (apart_mm / (1.1 * apart_mm[-1])) ** 2) ** 2
+    middle_mm = np.average(near_mm, axis=0, weights=weight)
+    normal = np.linalg.eigh(np.cov(near_mm.T, aweights=weight))[1][:, 0]
+    rim_mm = _plane_section(twin, middle_mm, normal, start_mm, 2.0 * reach_mm)
+    rim_mm = np.concatenate([start_mm[None], rim_mm[tree.query(rim_mm)[0] <= reach_mm]])
+    scatter_mm = float(np.sqrt(np.average(((near_mm - middle_mm) @ normal) ** 2, weights=weight)))
+    return rim_mm[int(np.argmin(rim_mm[:, 2]))], scatter_mm
 
 
 def _bare_mm(end_mm: Floats, found: Field, reach_mm: float) -> float:
