@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.errors import CannotRegister
-from geometry.registration.register import Alignment, register
+from geometry.registration.alignment import Alignment
+from geometry.registration.register import register
 from geometry.registration.uncertainty import certainty
 from geometry.transforms import apply, inverse, log, rigid
 from geometry.types import Cloud, Floats

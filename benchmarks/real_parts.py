@@ -25,7 +25,7 @@ from benchmarks.views import row_of
 from geometry.blade.nominal import Nominal
 from geometry.damage.skin import Skin
 from geometry.errors import CannotMeasure
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.registration.uncertainty import certainty
 from geometry.sections.airfoil import SectionSettings, measure_sections
 from geometry.transforms import apply, inverse, log

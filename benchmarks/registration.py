@@ -33,9 +33,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
+from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import CoarseSettings, find_pose
 from geometry.registration.fit import Fit, fit_kept, motions
-from geometry.registration.register import Alignment, held_by_ends, mask_damage, register
+from geometry.registration.register import mask_damage, register
+from geometry.registration.settled import held_by_ends
 from geometry.registration.uncertainty import certainty
 from geometry.scan.clean import clean
 from geometry.thesis.fine_tuned import register_thesis

@@ -26,7 +26,8 @@ import numpy as np
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
-from geometry.registration.register import Alignment, register
+from geometry.registration.alignment import Alignment
+from geometry.registration.register import register
 from geometry.thesis.stiff_twin import ThesisTwinSettings, fit_twin_thesis
 from geometry.transforms import apply, inverse
 from geometry.types import Bools, Cloud, Floats, Mesh

@@ -29,7 +29,7 @@ from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.blade.solid import slice_loops
 from geometry.damage.damages import find_damages
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.repair.patches import RepairSettings, find_repairs
 from geometry.types import Bools, Cloud, Floats, Mesh
 from tests.geometry import twin_blades as blades

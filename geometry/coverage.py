@@ -13,7 +13,7 @@ from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
 from geometry.kernels.facing_marks import FacingMarks
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.repair.patches import RepairVolume
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Mesh, Zone

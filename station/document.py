@@ -15,8 +15,8 @@ from station.software import software_commit, software_version
 if TYPE_CHECKING:
     from geometry.coverage import ZoneCoverage
     from geometry.damage.damages import Damage
+    from geometry.registration.alignment import Alignment
     from geometry.registration.datums import ServiceMotion
-    from geometry.registration.register import Alignment
     from geometry.repair.patches import Patch
     from geometry.sections.airfoil import Section
     from geometry.sections.blade_line import BladeLine

@@ -11,7 +11,7 @@ from geometry.errors import BadInput
 from geometry.transforms import check_rigid
 
 if TYPE_CHECKING:
-    from geometry.registration.register import Alignment
+    from geometry.registration.alignment import Alignment
     from station.measurement import Measurement
     from station.plans import BladePlan
 

@@ -18,7 +18,8 @@ from geometry.coverage import measure_coverage
 from geometry.damage.damages import Damage, DamageKind, DamageSettings, detection_limit, find_damages
 from geometry.deformation.twin import Twin
 from geometry.errors import CannotMeasure
-from geometry.registration.register import Alignment, mask_damage
+from geometry.registration.alignment import Alignment
+from geometry.registration.register import mask_damage
 from geometry.repair.patches import Patch, RepairVolume, find_repairs
 from geometry.scan.clean import CleanSettings, clean
 from geometry.scan.fuse import fuse

@@ -13,8 +13,8 @@ from geometry.types import Floats, Measured, NotMeasured, Zone
 if TYPE_CHECKING:  # the rooms behind these types are heavy, and who only judges or shows needs none of them
     from geometry.coverage import ZoneCoverage
     from geometry.damage.damages import Damage
+    from geometry.registration.alignment import Alignment
     from geometry.registration.datums import ServiceMotion
-    from geometry.registration.register import Alignment
     from geometry.repair.patches import RepairVolume
     from geometry.sections.airfoil import Section
     from geometry.sections.blade_line import BladeLine

@@ -9,6 +9,7 @@ import numpy as np
 from geometry.blade.nominal import Nominal
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
 from geometry.errors import CannotFitTwin, CannotMeasure, CannotRegister
+from geometry.registration.alignment import Alignment
 from geometry.registration.datums import (
     ServiceMotion,
     register_root,
@@ -16,7 +17,7 @@ from geometry.registration.datums import (
     register_six_point,
     service_motion,
 )
-from geometry.registration.register import Alignment, register
+from geometry.registration.register import register
 from geometry.sections.airfoil import Section, measure_sections
 from geometry.thesis.fine_tuned import register_thesis
 from geometry.thesis.rwlls_sections import ThesisSectionSettings, measure_sections_thesis

@@ -20,7 +20,7 @@ from geometry.damage.regions import (
     stand_off,
 )
 from geometry.deformation.twin import Twin
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.scan.neighbourhood import nearest_of
 from geometry.threads import one_blas_thread
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone

@@ -13,7 +13,7 @@ from geometry.damage.skin import skin_of
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.scan.neighbourhood import nearest_of
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints

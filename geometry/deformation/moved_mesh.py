@@ -8,7 +8,7 @@ from geometry.deformation.freeform import swell
 from geometry.deformation.ground import Ground
 from geometry.deformation.kriging import Wear
 from geometry.deformation.offset import Nodes, Offset
-from geometry.registration.register import Alignment, variance_along
+from geometry.registration.alignment import Alignment, variance_along
 from geometry.types import Bools, Floats, Ints, Measurand, Measured, NotMeasured
 
 CARE = 1.25  # wear need not follow one prior everywhere: so much is its sigma widened where nothing is seen

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Closest, Nominal
 from geometry.errors import BadInput, CannotRegister
+from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.registration.fit import (
     Fit,
     every,
@@ -20,7 +21,7 @@ from geometry.registration.fit import (
     unit_motions,
     unit_twist,
 )
-from geometry.registration.register import Alignment, RegisterSettings, mask_damage, pose_covariance
+from geometry.registration.register import RegisterSettings, mask_damage
 from geometry.registration.uncertainty import certainty, form_covariance
 from geometry.robust import TUKEY, robust_sigma
 from geometry.transforms import apply, exp, inverse, log

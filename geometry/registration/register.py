@@ -6,58 +6,19 @@ import numpy as np
 
 from geometry.blade.nominal import Closest, Nominal
 from geometry.errors import BadInput, CannotRegister
+from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import Coarse, CoarseSettings, find_pose
-from geometry.registration.ends import End, on_rim, scan_ends, without_strays
-from geometry.registration.fit import (
-    Fit,
-    Held,
-    every,
-    felt,
-    fit_kept,
-    fit_robust,
-    information,
-    motions,
-    unit_motions,
-    unit_twist,
-)
+from geometry.registration.ends import on_rim, without_strays
+from geometry.registration.fit import Fit, every, felt, fit_kept, fit_robust, unit_twist
 from geometry.registration.mask import MaskSettings, damaged, form_of
+from geometry.registration.settled import Settled, held_by_ends
 from geometry.registration.size import check_size
 from geometry.registration.slide import LEAST, slides_mm
-from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
 from geometry.robust import robust_sigma
 from geometry.scan.neighbourhood import nearest_of
 from geometry.threads import one_blas_thread
-from geometry.transforms import apply, exp, inverse
-from geometry.types import Bools, Cloud, Floats, Ints
-
-ENDS_MM = 0.01  # standard uncertainty of the surface along a motion beyond which ends of the scan are asked
-LEAST_WEIGHT = 1e-3  # of an end beside all points: enough that no step leaves it out
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Alignment:
-    """The pose of the scan on the nominal, how it was found and how certain it is.
-
-    A pose error is a twist (rx, ry, rz in rad, tx, ty, tz in mm) that turns about `pivot_mm` and
-    then shifts, applied on the nominal side: `exp(twist, pivot_mm) @ T_nominal_scan`.
-    `information` (6, 6) is the inverse covariance of that twist from point noise alone;
-    `form_covariance` (6, 6) is what the form of the part adds to that covariance: deviations that many
-    neighbouring points share. Both together are the uncertainty of the pose.
-    """
-
-    method: str
-    T_nominal_scan: Floats  # (4, 4)
-    pivot_mm: Floats  # (3,), nominal frame
-    information: Floats  # (6, 6)
-    weak_directions: tuple[tuple[float, ...], ...]  # unit twists the surface leaves free, or nearly so
-    rms_mm: float  # of the kept points, along the normal
-    noise_mm: float  # robust standard deviation of the kept residuals
-    inlier_fraction: float  # kept as undamaged
-    explained_fraction: float  # scan points that the nominal explains (within a few tenths of a mm)
-    runner_up_ratio: float  # score of the second-best coarse pose over the best; 1 = ambiguous
-    iterations: int
-    converged: bool
-    form_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+from geometry.transforms import apply, exp
+from geometry.types import Bools, Cloud, Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,18 +63,6 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
     return _alignment(cloud, nominal, places, coarse, robust.iterations, settings)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Settled:
-    """A least-squares pose, the points it rests on, and how certain it is."""
-
-    fit: Fit
-    kept: Bools
-    normal_matrix: Floats  # (6, 6) of the kept points, unweighted
-    information: Floats
-    form_covariance: Floats
-    certainty: Certainty
-
-
 def _thinned(cloud: Cloud, most: int) -> Cloud:
     if len(cloud) <= most:
         return cloud
@@ -140,75 +89,6 @@ def _settled(
 def _past_rims_none(found: Closest, nominal: Nominal) -> Closest:
     """The same feet, those on a rim without a distance: a scan may slide past its end and is no damage."""
     return replace(found, distance_mm=np.where(on_rim(nominal, found.points_mm), 0.0, found.distance_mm))
-
-
-def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
-    """What a least-squares pose on the sound points (n,) is worth; where these leave a motion open and the
-    scan stops sharply at both ends of the nominal, the pose that lays these ends on it, too.
-    """
-    resting = without_strays(sound, fit.found, nominal)
-    settled = _worth(cloud, fit, resting, nominal)
-    if not settled.certainty.sigma_mm[-1] > ENDS_MM:
-        return settled
-    moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
-    ends = scan_ends(moved_mm, sound, fit.found, nominal)
-    if not ends:
-        return settled
-    held = _held(ends, settled, nominal)
-    again = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
-    return _with_ends(
-        settled, replace(again, iterations=fit.iterations + again.iterations), held, ends, nominal
-    )
-
-
-def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
-    kept = sound & felt(nominal, fit.found)
-    moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
-    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept])
-    form = form_covariance(nominal, moved_mm, found)
-    design = motions(moved_mm, found.normals, nominal.pivot_mm)
-    return Settled(
-        fit=fit,
-        kept=kept,
-        normal_matrix=design.T @ design,
-        information=known,
-        form_covariance=form,
-        certainty=certainty(nominal, known, form),
-    )
-
-
-def _held(ends: tuple[End, ...], settled: Settled, nominal: Nominal) -> Held:
-    """The ends, each weighted as the points are: by the variance that these show along the open motion."""
-    open_ = settled.certainty.twists[:, -1]
-    a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
-    least = LEAST_WEIGHT * len(settled.kept)
-    back = inverse(settled.fit.T_nominal_scan)
-    return Held(
-        points_mm=apply(back, np.array([end.point_mm for end in ends])),
-        heights_mm=np.array([end.height_mm for end in ends]),
-        weights=np.array([max(a_point_mm2 / end.sigma_mm**2, least) for end in ends]),
-    )
-
-
-def _with_ends(settled: Settled, fit: Fit, held: Held, ends: tuple[End, ...], nominal: Nominal) -> Settled:
-    """The same points with ends beside them: covariances as that weighted least squares passes them on."""
-    rows = held.rows(fit.T_nominal_scan, nominal.pivot_mm)
-    weighted = rows.design.T * rows.weights
-    scale = unit_motions(nominal)
-    unit = np.outer(scale, scale)
-    both = np.linalg.inv((settled.normal_matrix + weighted @ rows.design) * unit) * unit
-    share = both @ settled.normal_matrix
-    noise = share @ free_inverse(settled.information, scale) @ share.T
-    noise += both @ (weighted * [end.sigma_mm**2 for end in ends]) @ weighted.T @ both
-    known = np.linalg.inv(noise / unit) / unit
-    form = share @ settled.form_covariance @ share.T
-    return replace(
-        settled,
-        fit=fit,
-        information=known,
-        form_covariance=form,
-        certainty=certainty(nominal, known, form),
-    )
 
 
 def _elsewhere(
@@ -299,16 +179,3 @@ def mask_damage(
     found = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
     neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
     return _damage_of(cloud, found, neighbours, nominal, settings)
-
-
-def pose_covariance(alignment: Alignment) -> Floats:
-    """Covariance (6, 6) of the pose twist from noise; where the surface leaves it free, 1 mm or 0.02 rad."""
-    prior = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0]) ** -2.0
-    return np.linalg.inv(alignment.information + np.diag(prior)).astype(np.float64)
-
-
-def variance_along(alignment: Alignment, point_mm: Floats, normal: Floats) -> float:
-    """Variance (mm^2) from point noise of the pose at a point (3,) along a normal (3,), nominal frame."""
-    lever = np.concatenate([np.cross(point_mm - alignment.pivot_mm, normal), normal])
-    covariance = np.linalg.pinv(alignment.information, rcond=1e-14, hermitian=True)
-    return max(float(lever @ covariance @ lever), 0.0)

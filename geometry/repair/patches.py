@@ -14,7 +14,7 @@ from geometry.damage.depth import BORDER
 from geometry.damage.skin import Skin, skin_of
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput, CannotRepair
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.repair.border import border_of
 from geometry.repair.columns import volume_by_columns
 from geometry.repair.cut_body import Reach, cut_body

@@ -10,7 +10,7 @@ import numpy as np
 
 from geometry.blade.nominal import Nominal
 from geometry.errors import CannotMeasure
-from geometry.registration.register import Alignment, pose_covariance
+from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.chart import Chart, SectionSettings, unroll
 from geometry.sections.curve import Estimate, centroid, node_shares
 from geometry.sections.form import SIDES, share_beyond_sigma

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from geometry.errors import BadInput
-from geometry.registration.register import Alignment, pose_covariance
+from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.airfoil import Section, Stacking
 from geometry.types import Floats, Measurand, Measured, NotMeasured, Unit
 

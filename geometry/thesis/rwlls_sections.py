@@ -11,7 +11,7 @@ import numpy as np
 
 from geometry.blade.nominal import Nominal
 from geometry.errors import CannotMeasure
-from geometry.registration.register import Alignment, pose_covariance
+from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.airfoil import Section, SectionStatus
 from geometry.sections.chart import NODES, Chart, SectionSettings, outward_normals, unroll
 from geometry.sections.curve import Estimate, node_shares

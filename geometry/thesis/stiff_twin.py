@@ -12,7 +12,7 @@ from geometry.deformation.twin import Twin
 from geometry.errors import CannotFitTwin
 from geometry.kernels.stiff_quadric import TERMS
 from geometry.kernels.thinplate import linear_weights
-from geometry.registration.register import Alignment, variance_along
+from geometry.registration.alignment import Alignment, variance_along
 from geometry.robust import robust_sigma
 from geometry.thesis.region_growing import grow_damage
 from geometry.thesis.stiff_fit import (

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from geometry.blade.nominal import Nominal, NominalSection
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.sections.profile import Scan, scan_of
 from geometry.types import Bools, Cloud, Floats, Ints
 from tests.geometry.poses import in_place

@@ -11,8 +11,9 @@ from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.damage.damages import Damage, find_damages
 from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
+from geometry.registration.alignment import Alignment
 from geometry.registration.fit import Fit, felt, fit_kept
-from geometry.registration.register import Alignment, mask_damage, register
+from geometry.registration.register import mask_damage, register
 from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
 from geometry.scan.calibrate import AxisCalibration
 from geometry.scan.clean import clean

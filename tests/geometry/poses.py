@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.types import Floats
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from geometry.damage.damages import Damage, DamageKind
 from geometry.deformation.twin import Twin
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.types import Cloud, Measurand, Mesh, NotMeasured, Zone
 from tests.geometry.poses import in_place
 

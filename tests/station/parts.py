@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.coverage import CoverageStatus, ZoneCoverage
 from geometry.damage.damages import Damage, DamageKind
-from geometry.registration.register import Alignment
+from geometry.registration.alignment import Alignment
 from geometry.repair.patches import Patch, RepairVolume
 from geometry.sections.airfoil import Section, SectionStatus
 from geometry.types import Measurand, Measured, Mesh, NotMeasured, Zone

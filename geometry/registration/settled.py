@@ -1,0 +1,96 @@
+"""A least-squares pose with what it is worth; ends of the scan hold what its surface leaves open."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.blade.nominal import Nominal
+from geometry.registration.ends import End, scan_ends, without_strays
+from geometry.registration.fit import Fit, Held, felt, fit_kept, information, motions, unit_motions
+from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
+from geometry.transforms import apply, inverse
+from geometry.types import Bools, Cloud, Floats
+
+ENDS_MM = 0.01  # standard uncertainty of the surface along a motion beyond which ends of the scan are asked
+LEAST_WEIGHT = 1e-3  # of an end beside all points: enough that no step leaves it out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Settled:
+    """A least-squares pose, the points it rests on, and how certain it is."""
+
+    fit: Fit
+    kept: Bools
+    normal_matrix: Floats  # (6, 6) of the kept points, unweighted
+    information: Floats
+    form_covariance: Floats
+    certainty: Certainty
+
+
+def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
+    """What a least-squares pose on the sound points (n,) is worth; where these leave a motion open and the
+    scan stops sharply at both ends of the nominal, the pose that lays these ends on it, too.
+    """
+    resting = without_strays(sound, fit.found, nominal)
+    settled = _worth(cloud, fit, resting, nominal)
+    if not settled.certainty.sigma_mm[-1] > ENDS_MM:
+        return settled
+    moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
+    ends = scan_ends(moved_mm, sound, fit.found, nominal)
+    if not ends:
+        return settled
+    held = _held(ends, settled, nominal)
+    again = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
+    return _with_ends(
+        settled, replace(again, iterations=fit.iterations + again.iterations), held, ends, nominal
+    )
+
+
+def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
+    kept = sound & felt(nominal, fit.found)
+    moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
+    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept])
+    form = form_covariance(nominal, moved_mm, found)
+    design = motions(moved_mm, found.normals, nominal.pivot_mm)
+    return Settled(
+        fit=fit,
+        kept=kept,
+        normal_matrix=design.T @ design,
+        information=known,
+        form_covariance=form,
+        certainty=certainty(nominal, known, form),
+    )
+
+
+def _held(ends: tuple[End, ...], settled: Settled, nominal: Nominal) -> Held:
+    """The ends, each weighted as the points are: by the variance that these show along the open motion."""
+    open_ = settled.certainty.twists[:, -1]
+    a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
+    least = LEAST_WEIGHT * len(settled.kept)
+    back = inverse(settled.fit.T_nominal_scan)
+    return Held(
+        points_mm=apply(back, np.array([end.point_mm for end in ends])),
+        heights_mm=np.array([end.height_mm for end in ends]),
+        weights=np.array([max(a_point_mm2 / end.sigma_mm**2, least) for end in ends]),
+    )
+
+
+def _with_ends(settled: Settled, fit: Fit, held: Held, ends: tuple[End, ...], nominal: Nominal) -> Settled:
+    """The same points with ends beside them: covariances as that weighted least squares passes them on."""
+    rows = held.rows(fit.T_nominal_scan, nominal.pivot_mm)
+    weighted = rows.design.T * rows.weights
+    scale = unit_motions(nominal)
+    unit = np.outer(scale, scale)
+    both = np.linalg.inv((settled.normal_matrix + weighted @ rows.design) * unit) * unit
+    share = both @ settled.normal_matrix
+    noise = share @ free_inverse(settled.information, scale) @ share.T
+    noise += both @ (weighted * [end.sigma_mm**2 for end in ends]) @ weighted.T @ both
+    known = np.linalg.inv(noise / unit) / unit
+    form = share @ settled.form_covariance @ share.T
+    return replace(
+        settled,
+        fit=fit,
+        information=known,
+        form_covariance=form,
+        certainty=certainty(nominal, known, form),
+    )
