@@ -13,7 +13,7 @@ from geometry.errors import CannotMeasure
 from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.chart import Chart, SectionSettings, unroll
 from geometry.sections.curve import Estimate, centroid, node_shares
-from geometry.sections.form import SIDES, share_beyond_sigma
+from geometry.sections.form import PROFILE_EXTREMES, SIDES, flattened_mm, share_beyond_sigma
 from geometry.sections.measurands import SECTION_MEASURANDS, Definition, define, form, place, shape
 from geometry.sections.profile import (
     Gap,
@@ -40,6 +40,7 @@ __all__ = [
     "with_damages",
 ]
 
+_RIM_MM = 1.0  # of a gap
 _AT_ONCE = 2  # sections; none knows of another, and most of their time is spent in compiled code
 
 
@@ -198,9 +199,14 @@ def _uncertainty(profile: Profile, estimates: Mapping[str, Estimate], alignment:
 
 
 def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty) -> Mapping[str, float]:
-    """Standard uncertainty of each estimate; apart for those that are no smooth function of the nodes."""
+    """Standard uncertainty of each estimate; apart for those that are no smooth function of the nodes.
+
+    An extreme of the profile rests on its one node, and bears what smoothing may have taken off it.
+    """
     covariance, estimates = uncertainty.covariance, uncertainty.estimates
     sigmas = dict(zip(estimates, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    for name in (name for name in estimates if name.endswith(PROFILE_EXTREMES)):
+        sigmas[name] = float(np.hypot(sigmas[name], _flattened_mm(name, profile, definition, estimates)))
     xy = uncertainty.rows("position_x_mm", "position_y_mm")
     sigmas["position_mm"] = _distance_sigma(estimates, covariance[np.ix_(xy, xy)])
     if "waviness_rms_mm" in estimates:
@@ -212,6 +218,24 @@ def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty)
             profile.deviation_mm, profile.node_sigmas(), share, definition.settings.tolerance_mm
         )
     return sigmas
+
+
+def _flattened_mm(
+    name: str, profile: Profile, definition: Definition, estimates: Mapping[str, Estimate]
+) -> float:
+    """What smoothing may have taken off an extreme; next to a gap points of its rim do not tell."""
+    node = int(np.argmax(np.abs(estimates[name].gradient)))
+    elsewhere = definition.supports()[name] & ~profile.open_nodes(margin_mm=_RIM_MM)
+    if "_form_" in name:  # distances after the fit are others
+        elsewhere = np.zeros_like(elsewhere)
+    sign = 1.0 if name.endswith("_max_mm") else -1.0
+    return flattened_mm(
+        sign * profile.deviation_mm,
+        node,
+        sign * profile.left_over_mm,
+        profile.left_over_sigma_mm,
+        elsewhere,
+    )
 
 
 def _stacking(profile: Profile, definition: Definition, uncertainty: _Uncertainty) -> Stacking:

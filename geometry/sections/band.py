@@ -33,6 +33,8 @@ _START = np.array([5e4, 5e4, 1e8])  # of the search for the strengths: those of 
 _RIGID_PRIOR = np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0  # weak: `find_motion` has taken most
 _PILOT_BINS = (2, 4)  # ... in each knot span along the arc, and across
 _BINS = (4, 4)  # the same for all points
+_NEXT_MM, _NEXT_POINTS = 0.4, 5  # along the arc and the span, of points that lie next to a node; at least
+_MEDIAN = 1.2533  # standard error of a median over that of a mean
 _LIKELIER = 9.0  # twice the gain in log likelihood
 _ARM_MM = 10.0  # a turn counts as the movement of a point so far from the centroid
 
@@ -115,12 +117,15 @@ class Band:
 
     def few(self) -> "Band":
         """A share of the points, evenly through them."""
-        step = max(1, len(self.node) // _PILOT_POINTS)
+        return self.of(slice(None, None, max(1, len(self.node) // _PILOT_POINTS)))
+
+    def of(self, chosen: Bools | slice) -> "Band":
+        """The chosen points."""
         return Band(
-            node=self.node[::step],
-            z_mm=self.z_mm[::step],
-            sigma_mm=self.sigma_mm[::step],
-            rows=np.ascontiguousarray(self.rows[::step]),
+            node=self.node[chosen],
+            z_mm=self.z_mm[chosen],
+            sigma_mm=self.sigma_mm[chosen],
+            rows=np.ascontiguousarray(self.rows[chosen]),
         )
 
     def laid(self, knots: Knots) -> "LaidBand":
@@ -149,10 +154,14 @@ class LaidBand:
             count=int(np.count_nonzero(keep)),
         )
 
+    def off_mm(self, coefficients: Floats, free: Floats) -> Floats:
+        """Signed distance from a fit."""
+        off_mm: Floats = band_misfit(self.u, self.v, self.band.rows, coefficients, free)
+        return off_mm
+
     def misfit(self, coefficients: Floats, free: Floats) -> Floats:
         """Distance from a fit in units of each point's sigma."""
-        off: Floats = np.abs(band_misfit(self.u, self.v, self.band.rows, coefficients, free))
-        return off / self.band.sigma_mm
+        return np.abs(self.off_mm(coefficients, free)) / self.band.sigma_mm
 
 
 def band_of(chart: Chart, z_mm: Floats, settings: SectionSettings) -> tuple[float, float]:
@@ -207,6 +216,30 @@ def robust_fit(
     keep = laid.misfit(coefficients, pilot.free) <= most
     fit = fit_spline(laid.sums(keep, penalty, _BINS), penalty, _START)
     return keep, knots, _steadied(fit, knots, chart.curve_mm)
+
+
+def left_over(band: Band, knots: Knots, fit: SplineFit, chart: Chart) -> tuple[Floats, Floats]:
+    """How far off the fit the points next to each node (NODES,) of the section lie, and how sure that is.
+
+    The median of all near points, kept or not; sigma is inf where there are hardly any. One strength of
+    smoothing for all sides, and one for the edges, flattens what bends more sharply than they do as a
+    rule: at the rim of a break, or a scratch. The fit's own covariance does not know.
+    """
+    near = band.of(np.abs(band.z_mm - chart.section_z_mm) <= _NEXT_MM)
+    arc_mm = chart.arc_at(near.node)
+    order = np.argsort(arc_mm)
+    off_mm = np.tile(near.laid(knots).off_mm(fit.coefficients, fit.free)[order], 3)
+    variance_mm2 = fit.scale * np.tile(near.sigma_mm[order] ** 2, 3)
+    laps_mm = np.concatenate([arc_mm[order] + lap * chart.perimeter_mm for lap in (-1.0, 0.0, 1.0)])
+    middles_mm = np.linspace(0.0, chart.perimeter_mm, max(2, round(chart.perimeter_mm / _NEXT_MM)) + 1)
+    left_mm, sigma_mm = np.zeros(len(middles_mm)), np.full(len(middles_mm), np.inf)
+    for i, middle_mm in enumerate(middles_mm):
+        window = slice(*np.searchsorted(laps_mm, (middle_mm - _NEXT_MM, middle_mm + _NEXT_MM)))
+        if window.stop - window.start >= _NEXT_POINTS:
+            left_mm[i] = np.median(off_mm[window])
+            sigma_mm[i] = _MEDIAN * np.sqrt(variance_mm2[window].mean() / (window.stop - window.start))
+    nearest = np.rint(chart.arc_mm[:-1] / middles_mm[1]).astype(np.int64)
+    return left_mm[nearest], sigma_mm[nearest]
 
 
 def _steadied(fit: SplineFit, knots: Knots, nominal_mm: Floats) -> SplineFit:

@@ -12,6 +12,8 @@ from geometry.sections.curve import Estimate
 from geometry.types import Bools, Floats, Ints
 
 SIDES = ("le", "ss", "te", "ps")  # as `NominalSection.side` numbers them: edges, suction, pressure side
+SURE = 5.0  # standard errors of what noise cannot explain
+PROFILE_EXTREMES = ("profile_max_mm", "profile_min_mm", "profile_form_max_mm", "profile_form_min_mm")
 
 
 def extremes(deviation_mm: Floats, seen: Bools, side: Ints) -> dict[str, Estimate]:
@@ -34,6 +36,20 @@ def _at(deviation_mm: Floats, node: int) -> Estimate:
     gradient = np.zeros(len(deviation_mm))
     gradient[node] = 1.0
     return Estimate(value=float(deviation_mm[node]), gradient=gradient)
+
+
+def flattened_mm(
+    deviation_mm: Floats, node: int, left_over_mm: Floats, sigma_mm: Floats, elsewhere: Bools
+) -> float:
+    """What smoothing may have taken off an extreme of the profile, as its largest deviation, at `node`.
+
+    There it is what the points next to the node leave over (m,) beyond their noise `sigma_mm` (m,);
+    `elsewhere` (m,) what noise cannot explain and would be a farther extreme.
+    """
+    here = float(np.sqrt(max(left_over_mm[node] ** 2 - sigma_mm[node] ** 2, 0.0)))
+    sure = elsewhere & (np.abs(left_over_mm) > SURE * sigma_mm)
+    there = np.where(sure, deviation_mm + left_over_mm, -np.inf).max()
+    return max(here, float(there - deviation_mm[node]))
 
 
 def share_beyond(deviation_mm: Floats, share_mm: Floats, tolerance_mm: Floats | float) -> float:

@@ -12,7 +12,7 @@ from geometry.blade.nominal import Nominal
 from geometry.errors import CannotMeasure
 from geometry.kernels.profile_spline import SplineFit
 from geometry.kernels.tensor_spline import cubic_weights
-from geometry.sections.band import Knots, band_of, onto_chart, robust_fit
+from geometry.sections.band import Knots, band_of, left_over, onto_chart, robust_fit
 from geometry.sections.chart import (
     NODES,
     Chart,
@@ -58,14 +58,17 @@ class Profile:
     knots: Knots
     fit: SplineFit
     columns: Floats  # (NODES, 6) of the fit's free part at the nodes
+    left_over_mm: Floats  # (NODES,) how far off the profile the points next to each node lie ...
+    left_over_sigma_mm: Floats  # ... and how sure that is; inf where there are none
 
-    def open_nodes(self, damaged: bool | None = None) -> Bools:
-        """Nodes inside a gap: any, or only those inside gaps of damage (or of no damage)."""
-        arc = self.chart.arc_mm[:-1]
+    def open_nodes(self, damaged: bool | None = None, margin_mm: float = 0.0) -> Bools:
+        """Nodes inside a gap, or as near to one: any, or only gaps of damage (or of no damage)."""
+        arc = self.chart.arc_mm[:-1] + margin_mm
         inside = np.zeros(NODES, bool)
         for gap in self.gaps:
             if damaged is None or gap.in_damage == damaged:
-                inside |= (arc - gap.start_mm) % self.chart.perimeter_mm <= gap.width_mm
+                beyond_mm = (arc - gap.start_mm) % self.chart.perimeter_mm
+                inside |= beyond_mm <= gap.width_mm + 2.0 * margin_mm
         return inside
 
     def covariance(self, gradients: Floats) -> Floats:
@@ -141,12 +144,15 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     profile = _profile(chart, motion, knots, fit, float(np.median(band.few().sigma_mm)))
     widest = _widest(chart.perimeter_mm, len(arc), settings)
     used = band.z_mm[keep]
+    left_mm, left_sigma_mm = left_over(band, knots, fit, chart)
     return replace(
         profile,
         gaps=find_gaps(chart, arc, widest),
         zones=cover_zones(chart.curve_mm, chart.side, arc, widest),
         band_mm=(float(used.min()), float(used.max())),
         band_points=len(used),
+        left_over_mm=left_mm,
+        left_over_sigma_mm=left_sigma_mm,
     )
 
 
@@ -174,6 +180,8 @@ def _profile(chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, sigma_m
         knots=knots,
         fit=fit,
         columns=columns,
+        left_over_mm=np.zeros(NODES),
+        left_over_sigma_mm=np.full(NODES, np.inf),
     )
 
 
