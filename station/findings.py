@@ -175,9 +175,9 @@ def blade_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Findin
 
 
 def form_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Finding]:
-    """The finding of the twin against the nominal, if the plan limits it."""
+    """The finding of the twin against the nominal, or of metal bent farther off the twin, if limited."""
     limit, name = plan.limits.form.deviation_mm, "form.deviation_mm"
-    match limit, measurement.form_mm:
+    match limit, largest(measurement.form_mm, *(damage.depth_mm for damage in bent(measurement))):
         case Limit(), Measurand(value=value, sigma=sigma):
             yield measured_finding(name, limit, value, plan.measurement.coverage_factor * sigma, 0.0)
         case Limit(), NotMeasured(reason=reason):
@@ -189,6 +189,11 @@ def judged_damages(measurement: Measurement) -> Iterator[tuple[int, Damage]]:
     for index, damage in enumerate(measurement.damages or ()):
         if damage.zone in JUDGED_ZONES and damage.kind.value != "deformation":
             yield index, damage
+
+
+def bent(measurement: Measurement) -> Iterator[Damage]:
+    """Bent metal, which limits of sections and of form judge."""
+    return (damage for damage in measurement.damages or () if damage.kind.value == "deformation")
 
 
 def damage_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Finding]:

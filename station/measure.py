@@ -184,7 +184,7 @@ def inspected(
     if damages is None:
         return sections
     spans = [
-        damaged_span_mm(index, damage, points, alignment, recipe.nominal, repairs)
+        damaged_span_mm(index, damage, recipe.nominal, repairs)
         for index, damage in enumerate(damages)
         if damage.kind is not DamageKind.DEFORMATION
     ]
@@ -202,21 +202,17 @@ def damaged_metal(mask: Bools, twin: Twin, damages: Sequence[Damage]) -> Bools:
 
 
 def damaged_span_mm(
-    index: int,
-    damage: Damage,
-    points: Cloud,
-    alignment: Alignment,
-    nominal: Nominal,
-    repairs: RepairVolume | None,
+    index: int, damage: Damage, nominal: Nominal, repairs: RepairVolume | None
 ) -> tuple[float, float]:
     """The heights between which a damage lies: its points, its patch, and up to the end of a lost tip."""
-    z_mm = apply(alignment.T_nominal_scan, points.points_mm[damage.points])[:, 2]
+    low_mm, high_mm = damage.span_mm
     for patch in repairs.patches if repairs else ():
         if patch.damage == index:
-            z_mm = np.concatenate([z_mm, patch.mesh.vertices_mm[:, 2]])
+            z_mm = patch.mesh.vertices_mm[:, 2]
+            low_mm, high_mm = min(low_mm, float(z_mm.min())), max(high_mm, float(z_mm.max()))
     if damage.zone is Zone.TIP and damage.kind is DamageKind.MISSING:
-        z_mm = np.append(z_mm, nominal.z_max_mm)
-    return float(z_mm.min(initial=np.inf)), float(z_mm.max(initial=-np.inf))
+        high_mm = max(high_mm, nominal.z_max_mm)
+    return low_mm, high_mm
 
 
 def touches(z_mm: float, spans_mm: Sequence[tuple[float, float]]) -> bool:

@@ -21,7 +21,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Literal
 
 from geometry.types import Measurand, Measured
-from station.findings import Finding, Outcome, described, find, judged_damages
+from station.findings import Finding, Outcome, bent, described, find, judged_damages
 from station.gates import ACCEPTANCE, Acceptance, Cause, Gates, Reason, alignment_doubts, open_gates
 
 if TYPE_CHECKING:
@@ -131,13 +131,19 @@ def doubts(measurement: Measurement, plan: BladePlan, findings: Sequence[Finding
             cause = Cause.NOT_MEASURED if finding.judged is None else Cause.UNDECIDED
             yield Reason(cause=cause, text=described(finding))
     yield from overlooked(measurement, plan)
-    if deformed(measurement) and not (plan.limits.section or plan.limits.form.deviation_mm):
-        text = "deformation: the plan limits neither sections nor form"
-        yield Reason(cause=Cause.NOT_MEASURED, text=text)
+    if plan.limits.form.deviation_mm is None:
+        yield from unjudged_bends(measurement, plan)
 
 
-def deformed(measurement: Measurement) -> bool:
-    return any(damage.kind.value == "deformation" for damage in measurement.damages or ())
+def unjudged_bends(measurement: Measurement, plan: BladePlan) -> Iterator[Reason]:
+    """Bent metal that no limited section passes through, where the form has no limit."""
+    judged_mm = [z_mm for z_mm in plan.sections.z_mm if plan.limits.section.at(z_mm)]
+    for damage in bent(measurement):
+        low_mm, high_mm = damage.span_mm
+        if not any(low_mm <= z_mm <= high_mm for z_mm in judged_mm):
+            where = f"deformation at z {low_mm:.1f} to {high_mm:.1f} mm"
+            text = f"{where}: neither form nor a section there has a limit"
+            yield Reason(cause=Cause.NOT_MEASURED, text=text)
 
 
 def unseen(measurement: Measurement, plan: BladePlan) -> Iterator[Reason]:

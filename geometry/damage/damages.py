@@ -52,6 +52,7 @@ class Damage:
     area_mm2: Measured  # of the lost skin
     volume_mm3: Measured
     length_mm: float  # largest extent
+    span_mm: tuple[float, float]  # lowest and highest of its points, along the span
     centroid_mm: Floats  # (3,)
     points: Ints  # indices of the scan points on the damaged surface
     remaining_chord_mm: Measured = NOT_AN_EDGE  # least, of a section there
@@ -64,6 +65,7 @@ class DamageSettings:
     regions: RegionSettings = field(default_factory=RegionSettings)
     touching: float = 0.03  # share of a damage that must lie in a zone for the damage to touch it
     alike: float = 0.35  # least ratio of sizes of the two sides of a bent region
+    behind: float = 0.6  # least share of its skin that looks away from the other side
     beside_mm: float = 6.0  # how near those sides lie: about the thickness of an airfoil
 
 
@@ -78,13 +80,13 @@ def find_damages(
 ) -> tuple[Damage, ...]:
     """The damages of the airfoil, largest first.
 
-    A damage is connected metal that lies off the twin by more than noise and twin allow. What is missing and
-    in excess side by side, in like amounts, is one bent region. `mask` is not needed to find them: damage is
-    told against the twin, not against the nominal.
+    A damage is connected metal that lies off the twin by more than noise and twin allow. What is missing on
+    one side of the metal and in excess on the other, in like amounts, is one bent region. `mask` is not
+    needed to find them: damage is told against the twin, not against the nominal.
     """
     found = stand_off(cloud, alignment, nominal, twin, settings.regions)
     regions = find_regions(found, nominal, settings.regions)
-    bent, single = _bent_pairs(regions, found, settings)
+    bent, single = _bent_pairs(regions, found, nominal, settings)
     damages = [_described(region, found, nominal, twin, settings) for region in single]
     damages += [_bent(a, b, found, nominal, settings) for a, b in bent]
     return _spaced(damages, found)
@@ -122,14 +124,16 @@ def _limit(zone: Zone, value_mm: float) -> Measured:
 
 
 def _bent_pairs(
-    regions: list[Region], found: Field, settings: DamageSettings
+    regions: list[Region], found: Field, nominal: Nominal, settings: DamageSettings
 ) -> tuple[list[tuple[Region, Region]], list[Region]]:
-    """Pairs of a missing and an excess region side by side in like amounts, and the regions left over."""
+    """Pairs of a missing and an excess region that are the two sides of bent metal, and the regions left."""
     free = list(regions)
     pairs = []
-    for missing in [region for region in regions if region.missing and not len(region.lost)]:
+    for missing in [region for region in regions if region.missing]:
         mates = [
-            region for region in free if not region.missing and _mirror(missing, region, found, settings)
+            region
+            for region in free
+            if not region.missing and _two_sides(missing, region, found, nominal, settings)
         ]
         if mates:
             pairs.append((missing, mates[0]))
@@ -138,14 +142,35 @@ def _bent_pairs(
     return pairs, free
 
 
-def _mirror(missing: Region, excess: Region, found: Field, settings: DamageSettings) -> bool:
-    """Whether two regions are the two sides of bent metal: as large, as far off, and near each other."""
+def _two_sides(
+    missing: Region, excess: Region, found: Field, nominal: Nominal, settings: DamageSettings
+) -> bool:
+    """Whether two regions are the two sides of bent metal: near each other, as large, as far off, and the one
+    looks away from the other.
+
+    A break has lost skin on both sides of the metal, or on the side of its own burr. Metal bent by more than
+    its thickness shows no more than half of that as missing.
+    """
     sizes = [float(len(region.points)) for region in (missing, excess)]
-    heights = [float(np.abs(found.smooth_mm[region.points]).max()) for region in (missing, excess)]
-    if min(sizes) < settings.alike * max(sizes) or min(heights) < settings.alike * max(heights):
+    gone_mm, over_mm = (float(np.abs(found.smooth_mm[region.points]).max()) for region in (missing, excess))
+    if min(sizes) < settings.alike * max(sizes) or over_mm < settings.alike * gone_mm:
+        return False
+    if not len(missing.lost) and gone_mm < settings.alike * over_mm:
         return False
     nearest_mm, _ = cKDTree(found.scan_mm[excess.points]).query(found.scan_mm[missing.points])
-    return bool(np.median(nearest_mm) <= settings.beside_mm)
+    if np.median(nearest_mm) > settings.beside_mm:
+        return False
+    return _share_behind(missing, excess, found, nominal) >= settings.behind
+
+
+def _share_behind(missing: Region, excess: Region, found: Field, nominal: Nominal) -> float:
+    """The share of the skin over missing metal that looks away from the skin under the excess."""
+    samples, tree = nominal.samples, cKDTree(found.skin_mm)
+    under = np.asarray(tree.query(found.scan_mm[excess.points])[1])
+    over = missing.lost if len(missing.lost) else np.asarray(tree.query(found.scan_mm[missing.points])[1])
+    way = samples.normals[under].mean(axis=0)
+    away = samples.normals[over] @ way < -0.3 * np.linalg.norm(way)
+    return float(samples.area_mm2[over][away].sum() / samples.area_mm2[over].sum())
 
 
 def _described(
@@ -162,6 +187,7 @@ def _described(
         area_mm2=_area(region, found, nominal),
         volume_mm3=_volume(region, found),
         length_mm=_length_mm(body_mm),
+        span_mm=_span_mm(region, found),
         centroid_mm=body_mm.mean(axis=0),
         points=region.points,
         remaining_chord_mm=loss.remaining_chord_mm,
@@ -225,6 +251,7 @@ def _bent(
         area_mm2=_area(both, found, nominal),
         volume_mm3=NotMeasured(reason="bent metal is neither missing nor in excess"),
         length_mm=_length_mm(found.scan_mm[points]),
+        span_mm=_span_mm(both, found),
         centroid_mm=found.scan_mm[points].mean(axis=0),
         points=points,
     )
@@ -265,6 +292,11 @@ def _volume(region: Region, found: Field) -> Measured:
     sigma = len(depth_mm) * share_mm2 * float(np.median(found.sigma_mm[region.points]))
     value = float(depth_mm.sum()) * share_mm2
     return Measurand(name="volume", value=value, sigma=float(np.hypot(sigma, 0.05 * value)), unit="mm3")
+
+
+def _span_mm(region: Region, found: Field) -> tuple[float, float]:
+    z_mm = found.scan_mm[region.points, 2]
+    return float(z_mm.min()), float(z_mm.max())
 
 
 def _length_mm(points_mm: Floats) -> float:

@@ -327,6 +327,7 @@ def damage_at(
         area_mm2=nothing,
         volume_mm3=nothing,
         length_mm=float(np.ptp(points[broken], axis=0).max()),
+        span_mm=(float(points[broken, 2].min()), float(points[broken, 2].max())),
         centroid_mm=points[broken].mean(axis=0),
         points=np.flatnonzero(np.isfinite(distance)),
     )

@@ -125,6 +125,7 @@ def damage(
         area_mm2=number("area_mm2", 12.0),
         volume_mm3=number("volume_mm3", volume) if isinstance(volume, float | int) else volume,
         length_mm=9.0,
+        span_mm=(95.0, 105.0),
         centroid_mm=np.array([1.0, 2.0, 100.0]),
         points=np.arange(3),
     )

@@ -244,8 +244,8 @@ def test_only_a_damage_that_touches_excuses_a_section(geometry: dict[str, Any]) 
     geometry["cut_sections"] = (torn,)
     unexcused = measured().done.sections[0].measurands["chord_mm"]
     assert unexcused == NotMeasured(reason="masked, but no damage was found there")
-    geometry["find_damages"] = (replace(damage(Zone.LEADING_EDGE), points=np.array([3])),)
-    assert not measured().done.sections[0].measurands["chord_mm"].in_damage  # the damage is at 90 mm
+    geometry["find_damages"] = (replace(damage(Zone.LEADING_EDGE), span_mm=(89.0, 90.0)),)
+    assert not measured().done.sections[0].measurands["chord_mm"].in_damage
     geometry["cut_sections"] = (replace(torn, z_mm=90.4),)
     excused = measured().done.sections[0]
     assert excused.measurands["chord_mm"].in_damage
@@ -254,15 +254,15 @@ def test_only_a_damage_that_touches_excuses_a_section(geometry: dict[str, Any]) 
 
 def test_a_lost_tip_reaches_to_the_end_of_the_span(geometry: dict[str, Any]) -> None:
     geometry["cut_sections"] = (section(103.0, chord_mm=lost()),)
-    geometry["find_damages"] = (replace(damage(Zone.TIP), points=np.array([3])),)
+    geometry["find_damages"] = (replace(damage(Zone.TIP), span_mm=(89.0, 90.0)),)
     assert measured().done.sections[0].measurands["chord_mm"].in_damage
-    geometry["find_damages"] = (replace(damage(Zone.TIP, DamageKind.EXCESS), points=np.array([3])),)
+    geometry["find_damages"] = (replace(damage(Zone.TIP, DamageKind.EXCESS), span_mm=(89.0, 90.0)),)
     assert not measured().done.sections[0].measurands["chord_mm"].in_damage
 
 
 def test_a_patch_reaches_beyond_the_points(geometry: dict[str, Any]) -> None:
     geometry["cut_sections"] = (section(1.4, chord_mm=lost()),)
-    geometry["find_damages"] = (replace(damage(Zone.SURFACE), points=np.array([2])),)  # at 3 mm
+    geometry["find_damages"] = (replace(damage(Zone.SURFACE), span_mm=(3.0, 3.0)),)
     assert not measured().done.sections[0].measurands["chord_mm"].in_damage
     geometry["find_repairs"] = repairs(patch(0))  # from 0 to 1 mm
     assert measured().done.sections[0].measurands["chord_mm"].in_damage

@@ -213,7 +213,11 @@ def test_in_damage_is_not_judged_where_a_damage_was_found() -> None:
 
 @pytest.mark.parametrize(
     "elsewhere",
-    [damage(Zone.OUTSIDE), damage(kind=DamageKind.DEFORMATION), damage(Zone.OUTSIDE, DamageKind.EXCESS)],
+    [
+        damage(Zone.OUTSIDE),
+        damage(kind=DamageKind.DEFORMATION, depth=0.0),
+        damage(Zone.OUTSIDE, DamageKind.EXCESS),
+    ],
 )
 def test_only_damage_that_limits_judge_excuses_a_section(elsewhere: Any) -> None:
     done = verdict(sections=(section(chord_mm=lost(in_damage=True)),), damages=(elsewhere,))
@@ -322,12 +326,28 @@ def test_any_parameter_of_a_section_can_be_limited() -> None:
     assert found["sections[7.0].te_thickness_at_2_mm"].outcome == Outcome.HOLD  # it has no nominal here
 
 
-def test_deformation_is_judged_by_sections_and_form_only() -> None:
+@pytest.mark.parametrize(("depth", "word"), [(0.1, Word.PASS), (0.3, Word.REPAIR), (0.9, Word.SCRAP)])
+def test_bent_metal_is_judged_by_the_limits_of_form(depth: float, word: Word) -> None:
+    bent = damage(kind=DamageKind.DEFORMATION, depth=depth, volume=999.0)
+    done = verdict(damages=(bent,))
+    assert done.verdict == word
+    assert not done.patches
+
+
+def test_bent_metal_without_a_limit_of_form_needs_a_limited_section_on_it() -> None:
     bent = damage(kind=DamageKind.DEFORMATION, depth=99.0, volume=999.0)
-    assert verdict(damages=(bent,)).verdict == Word.PASS
-    no_form = plan({"damage": LIMITS["damage"]})
-    done = judge(measurement(damages=(bent,)), no_form, GATES)
-    assert done.reasons == ("deformation: the plan limits neither sections nor form",)
+    for sections, z_mm, word in (
+        (True, 100.0, Word.PASS),
+        (True, 90.0, Word.HOLD),
+        (False, 100.0, Word.HOLD),
+    ):
+        limits = {key: LIMITS[key] for key in ("damage", *(("section",) if sections else ()))}
+        given = measurement(damages=(bent,), sections=(section(z_mm),))
+        done = judge(given, plan(limits, z_mm=(z_mm,)), GATES)
+        assert done.verdict == word
+        if word == Word.HOLD:
+            text = "deformation at z 95.0 to 105.0 mm: neither form nor a section there has a limit"
+            assert text in done.reasons
 
 
 def test_damage_off_the_airfoil_is_not_judged() -> None:
