@@ -1,6 +1,6 @@
 """Was every required part of the surface seen? By zone, by area and by largest gap."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
+from geometry.damage.damages import Damage, DamageKind
 from geometry.damage.local_shape import frames_along
 from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin
@@ -62,16 +63,19 @@ def measure_coverage(
     twin: Twin | None,
     repairs: RepairVolume | None,
     settings: CoverageSettings,
+    damages: Sequence[Damage] = (),
 ) -> tuple[ZoneCoverage, ...]:
     """Coverage of every zone that has required surface, in the order of `ZONE_ORDER`.
 
     Measured on uniform samples of the nominal, each of which stands for its area: a sample is seen if a
     scan point lies on the same side of the part, within `normal_mm` of the skin (the twin's, or the
     nominal's without one) and within half the permitted gap along it; absent if it belongs to the
-    outer skin of a patch. Repeated points add nothing, and fewer points never see more.
+    outer skin of a patch. Points on metal in excess or bent show the skin that it took, however far off they
+    are. Repeated points add nothing, and fewer points never see more.
     """
     samples = nominal.samples
-    seen_mm, seen_normals = _seen_skin(cloud, alignment, nominal, twin, settings.normal_mm)
+    raised = _raised(len(cloud), damages)
+    seen_mm, seen_normals = _seen_skin(cloud, alignment, nominal, twin, settings.normal_mm, raised)
     absent = _absent(samples.points_mm, twin, repairs, settings.max_gap_mm)
     marks_mm = np.concatenate([seen_mm, samples.points_mm[absent]])
     marks_normals = np.concatenate([seen_normals, samples.normals[absent]])
@@ -149,16 +153,24 @@ def _nine(centres_mm: Floats, normals: Floats, step_mm: float) -> Floats:
 
 
 def _seen_skin(
-    cloud: Cloud, alignment: Alignment, nominal: Nominal, twin: Twin | None, normal_mm: float
+    cloud: Cloud, alignment: Alignment, nominal: Nominal, twin: Twin | None, normal_mm: float, raised: Bools
 ) -> tuple[Floats, Floats]:
-    """Where on the nominal (n, 3) the scan shows skin, and the nominal's normals there."""
+    """Where on the nominal (n, 3) the scan shows skin or what took its place, and the nominal's normals."""
     foot = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
     off_mm = foot.distance_mm
     if twin is not None:
         nearest = cKDTree(twin.mesh.vertices_mm - twin.displacement_mm).query(foot.points_mm)[1]
         off_mm = off_mm - (twin.displacement_mm[nearest] * foot.normals).sum(axis=1)
-    shown = np.abs(off_mm) <= normal_mm
+    shown = (np.abs(off_mm) <= normal_mm) | raised
     return foot.points_mm[shown], foot.normals[shown]
+
+
+def _raised(count: int, damages: Sequence[Damage]) -> Bools:
+    """Which of so many scan points lie on metal in excess or bent."""
+    raised = np.zeros(count, bool)
+    for damage in damages:
+        raised[damage.points] |= damage.kind is not DamageKind.MISSING
+    return raised
 
 
 def _on_twin(twin: Twin, points_mm: Floats) -> Floats:

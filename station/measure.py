@@ -96,6 +96,7 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
         twin=twin,
         repairs=repairs,
         settings=recipe.coverage_settings,
+        damages=damages or (),
     )
     shown = run.step("deviation", deviations, points, alignment, nominal)
     found = run.measurement(len(cloud))

@@ -8,6 +8,7 @@ import pytest
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.coverage import CoverageSettings, CoverageStatus, ZoneCoverage, measure_coverage
+from geometry.damage.damages import Damage, DamageKind, DamageSettings, find_damages
 from geometry.damage.skin import Skin
 from geometry.errors import BadInput
 from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
@@ -40,9 +41,11 @@ def repairs_of(specimen: blades.Specimen) -> RepairVolume:
     return find_repairs(specimen.twin, specimen.cloud, specimen.alignment, specimen.damages, RepairSettings())
 
 
-def coverage_of(specimen: blades.Specimen, repairs: RepairVolume | None = None) -> dict[Zone, ZoneCoverage]:
+def coverage_of(
+    specimen: blades.Specimen, repairs: RepairVolume | None = None, damages: tuple[Damage, ...] = ()
+) -> dict[Zone, ZoneCoverage]:
     rows = measure_coverage(
-        specimen.cloud, specimen.alignment, nominal(), specimen.twin, repairs, CoverageSettings()
+        specimen.cloud, specimen.alignment, nominal(), specimen.twin, repairs, CoverageSettings(), damages
     )
     return {row.zone: row for row in rows}
 
@@ -199,6 +202,27 @@ def test_a_part_far_from_nominal_is_seen_on_its_twin() -> None:
     assert Zone.SURFACE in seen(coverage_of(bent))
     alone = measure_coverage(bent.cloud, bent.alignment, nominal(), None, None, CoverageSettings())
     assert {row.zone: row.status for row in alone}[Zone.SURFACE] is CoverageStatus.UNSEEN
+
+
+def test_metal_in_excess_shows_the_skin_beneath_it() -> None:
+    """A weld bead; where its own top was not seen, nothing is known of what lies beneath."""
+    specimen = sound()
+    at_mm, outward = blades.pressure_side_at(0.5, 30.0)
+    away_mm = np.linalg.norm(specimen.cloud.points_mm - at_mm, axis=1)
+    lift_mm = 3.0 * np.clip(1.0 - (away_mm / 3.0) ** 2, 0.0, None)
+    raised = specimen.cloud.points_mm + lift_mm[:, None] * outward
+    bead = replace(specimen, cloud=replace(specimen.cloud, points_mm=raised))
+    (found,) = find_damages(
+        bead.cloud, np.zeros(len(raised), bool), bead.alignment, nominal(), bead.twin, DamageSettings()
+    )
+    assert found.kind is DamageKind.EXCESS
+    assert Zone.SURFACE not in seen(coverage_of(bead))
+    assert Zone.SURFACE in seen(coverage_of(bead, damages=(found,)))
+    bare = blades.without(bead, away_mm < 1.5)
+    (left,) = find_damages(
+        bare.cloud, np.zeros(len(bare.cloud), bool), bare.alignment, nominal(), bare.twin, DamageSettings()
+    )
+    assert Zone.SURFACE not in seen(coverage_of(bare, damages=(left,)))
 
 
 def test_no_points_at_all_is_unseen() -> None:
