@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
 from geometry.coverage import measure_coverage
@@ -37,6 +38,7 @@ T = TypeVar("T")
 Clock = Callable[[], float]
 Progress = Callable[[str], None]
 
+BEND_MARGIN_MM = 2.0  # the mask of the registration reaches so far beyond metal that is bent
 DAMAGE_MARGIN_MM = 0.5  # a section this near to a damage needs points that lie on it
 AXIS_SIGMAS = 6.0  # a scanner that was knocked; no calibration is that unlucky
 VIEW_BIAS_SIGMAS = 3.0  # a view that lies farther off the others was not taken where the table said
@@ -180,7 +182,7 @@ def inspected(
 ) -> tuple[Section, ...]:
     """The sections, measured on all metal that no limit of damage judges."""
     if twin is not None and damages is not None:
-        mask = damaged_metal(mask, twin, damages)
+        mask = damaged_metal(points, mask, twin, damages)
     sections = cut_sections(points, mask, alignment, recipe)
     if damages is None:
         return sections
@@ -192,13 +194,19 @@ def inspected(
     return tuple(settled(section, touches(section.z_mm, spans)) for section in sections)
 
 
-def damaged_metal(mask: Bools, twin: Twin, damages: Sequence[Damage]) -> Bools:
+def damaged_metal(points: Cloud, mask: Bools, twin: Twin, damages: Sequence[Damage]) -> Bools:
     """The scan points that limits of damage judge, and what neither twin nor nominal explains.
 
-    Deformed metal counts as sound, for its limits are those of sections and form."""
+    Deformed metal, and what is next to it, counts as sound: its limits are those of sections and form."""
     damaged = mask & ~twin.sound
     for damage in damages:
-        damaged[damage.points] = damage.kind is not DamageKind.DEFORMATION
+        if damage.kind is DamageKind.DEFORMATION:
+            left = np.flatnonzero(damaged)
+            apart_mm, _ = cKDTree(points.points_mm[damage.points]).query(points.points_mm[left])
+            damaged[left[apart_mm <= BEND_MARGIN_MM]] = False
+    for damage in damages:
+        if damage.kind is not DamageKind.DEFORMATION:
+            damaged[damage.points] = True
     return damaged
 
 

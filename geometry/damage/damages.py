@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
-from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
+from geometry.damage.depth import EdgeLoss, bend_depth, edge_loss, lowest_mm, normal_depth, span_depth
 from geometry.damage.detection import edge_limit_mm, tip_limit_mm
 from geometry.damage.regions import (
     Field,
@@ -247,7 +247,7 @@ def _bent(
     return Damage(
         zone=_zone(both, found, nominal, settings.touching),
         kind=DamageKind.DEFORMATION,
-        depth_mm=normal_depth(deeper, found),
+        depth_mm=bend_depth(deeper, found),
         area_mm2=_area(both, found, nominal),
         volume_mm3=NotMeasured(reason="bent metal is neither missing nor in excess"),
         length_mm=_length_mm(found.scan_mm[points]),

@@ -19,6 +19,7 @@ BORDER = 0.5  # standard uncertainty of where a break ends, in spacings of its p
 FRONT_POINTS = 30  # of the break about a height, whose quadric is the metal left there
 LEAST_FRONT = 10
 FRONT = 0.1  # standard uncertainty of that quadric between the points, in their spacings, at least
+FARTHEST = 5  # points on bent metal that tell how far it is bent
 HEIGHTS = 40  # over an edge damage, at most
 RIM_STEP_MM = 0.02  # between points of the twin's section at an edge
 NEAR_EDGE_MM = 6.0  # of the edge line, where the edge of the twin is sought
@@ -58,6 +59,17 @@ def _bottom(u_mm: Floats, v_mm: Floats, depth_mm: Floats, spacing_mm: float) -> 
         [2.0 * coefficients[3], 2.0 * coefficients[5], np.sqrt(2.0) * coefficients[4]]
     )
     return np.asarray(terms @ coefficients), float(bend_per_mm) * spacing_mm**2 / np.sqrt(8.0)
+
+
+def bend_depth(region: Region, found: Field) -> Measurand:
+    """How far bent metal lies off the twin: the median of its farthest points.
+
+    A corner is bent most at its end, where a surface through the points around would fall short of it.
+    """
+    off_mm = np.sort(np.abs(found.height_mm[region.points]))
+    value_mm = float(np.median(off_mm[-FARTHEST:]))
+    sigma_mm = np.linalg.norm([_sigma_mm(region, found), found.noise_mm, off_mm[-1] - value_mm])
+    return Measurand(name="depth", value=value_mm, sigma=float(sigma_mm), unit="mm")
 
 
 def span_depth(tip_mm: float, lowest: Measured) -> Measured:
