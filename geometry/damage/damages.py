@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
-from geometry.damage.depth import EdgeLoss, bend_depth, edge_loss, lowest_mm, normal_depth, span_depth
+from geometry.damage.bends import BendSettings, bend_depth, bent_pairs
+from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
 from geometry.damage.detection import edge_limit_mm, tip_limit_mm
 from geometry.damage.regions import (
     Field,
@@ -63,10 +64,8 @@ class Damage:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DamageSettings:
     regions: RegionSettings = field(default_factory=RegionSettings)
+    bends: BendSettings = field(default_factory=BendSettings)
     touching: float = 0.03  # share of a damage that must lie in a zone for the damage to touch it
-    alike: float = 0.35  # least ratio of sizes of the two sides of a bent region
-    behind: float = 0.6  # least share of its skin that looks away from the other side
-    beside_mm: float = 6.0  # how near those sides lie: about the thickness of an airfoil
 
 
 @one_blas_thread
@@ -86,7 +85,7 @@ def find_damages(
     """
     found = stand_off(cloud, alignment, nominal, twin, settings.regions)
     regions = find_regions(found, nominal, settings.regions)
-    bent, single = _bent_pairs(regions, found, nominal, settings)
+    bent, single = bent_pairs(regions, found, nominal, settings.bends)
     damages = [_described(region, found, nominal, twin, settings) for region in single]
     damages += [_bent(a, b, found, nominal, settings) for a, b in bent]
     return _spaced(damages, found)
@@ -121,56 +120,6 @@ def _limit(zone: Zone, value_mm: float) -> Measured:
     if not np.isfinite(value_mm):
         return NotMeasured(reason="no loss of an edge would show")
     return Measurand(name=f"{zone}_detection", value=value_mm, sigma=0.0, unit="mm")
-
-
-def _bent_pairs(
-    regions: list[Region], found: Field, nominal: Nominal, settings: DamageSettings
-) -> tuple[list[tuple[Region, Region]], list[Region]]:
-    """Pairs of a missing and an excess region that are the two sides of bent metal, and the regions left."""
-    free = list(regions)
-    pairs = []
-    for missing in [region for region in regions if region.missing]:
-        mates = [
-            region
-            for region in free
-            if not region.missing and _two_sides(missing, region, found, nominal, settings)
-        ]
-        if mates:
-            pairs.append((missing, mates[0]))
-            free.remove(missing)
-            free.remove(mates[0])
-    return pairs, free
-
-
-def _two_sides(
-    missing: Region, excess: Region, found: Field, nominal: Nominal, settings: DamageSettings
-) -> bool:
-    """Whether two regions are the two sides of bent metal: near each other, as large, as far off, and the one
-    looks away from the other.
-
-    A break has lost skin on both sides of the metal, or on the side of its own burr. Metal bent by more than
-    its thickness shows no more than half of that as missing.
-    """
-    sizes = [float(len(region.points)) for region in (missing, excess)]
-    gone_mm, over_mm = (float(np.abs(found.smooth_mm[region.points]).max()) for region in (missing, excess))
-    if min(sizes) < settings.alike * max(sizes) or over_mm < settings.alike * gone_mm:
-        return False
-    if not len(missing.lost) and gone_mm < settings.alike * over_mm:
-        return False
-    nearest_mm, _ = cKDTree(found.scan_mm[excess.points]).query(found.scan_mm[missing.points])
-    if np.median(nearest_mm) > settings.beside_mm:
-        return False
-    return _share_behind(missing, excess, found, nominal) >= settings.behind
-
-
-def _share_behind(missing: Region, excess: Region, found: Field, nominal: Nominal) -> float:
-    """The share of the skin over missing metal that looks away from the skin under the excess."""
-    samples, tree = nominal.samples, cKDTree(found.skin_mm)
-    under = np.asarray(tree.query(found.scan_mm[excess.points])[1])
-    over = missing.lost if len(missing.lost) else np.asarray(tree.query(found.scan_mm[missing.points])[1])
-    way = samples.normals[under].mean(axis=0)
-    away = samples.normals[over] @ way < -0.3 * np.linalg.norm(way)
-    return float(samples.area_mm2[over][away].sum() / samples.area_mm2[over].sum())
 
 
 def _described(

@@ -19,7 +19,6 @@ BORDER = 0.5  # standard uncertainty of where a break ends, in spacings of its p
 FRONT_POINTS = 30  # of the break about a height, whose quadric is the metal left there
 LEAST_FRONT = 10
 FRONT = 0.1  # standard uncertainty of that quadric between the points, in their spacings, at least
-FARTHEST = 5  # points on bent metal that tell how far it is bent
 HEIGHTS = 40  # over an edge damage, at most
 RIM_STEP_MM = 0.02  # between points of the twin's section at an edge
 NEAR_EDGE_MM = 6.0  # of the edge line, where the edge of the twin is sought
@@ -61,17 +60,6 @@ def _bottom(u_mm: Floats, v_mm: Floats, depth_mm: Floats, spacing_mm: float) -> 
     return np.asarray(terms @ coefficients), float(bend_per_mm) * spacing_mm**2 / np.sqrt(8.0)
 
 
-def bend_depth(region: Region, found: Field) -> Measurand:
-    """How far bent metal lies off the twin: the median of its farthest points.
-
-    A corner is bent most at its end, where a surface through the points around would fall short of it.
-    """
-    off_mm = np.sort(np.abs(found.height_mm[region.points]))
-    value_mm = float(np.median(off_mm[-FARTHEST:]))
-    sigma_mm = np.linalg.norm([_sigma_mm(region, found), found.noise_mm, off_mm[-1] - value_mm])
-    return Measurand(name="depth", value=value_mm, sigma=float(sigma_mm), unit="mm")
-
-
 def span_depth(tip_mm: float, lowest: Measured) -> Measured:
     """The loss along the span: from the twin's tip down to the lowest point of the break."""
     if isinstance(lowest, NotMeasured):
@@ -99,7 +87,7 @@ def lowest_mm(region: Region, found: Field, twin: Twin) -> Measured:
     bare_mm = _bare_mm(end_mm, found, 4.0 * reach_mm)
     border_mm = max(BORDER * found.spacing_mm, 0.5 * float(start[2] - end_mm[2]), 0.5 * bare_mm)
     bent_mm = float(wider_mm[2] - end_mm[2])
-    sigma_mm = float(np.linalg.norm([border_mm, scatter_mm, bent_mm, _sigma_mm(region, found)]))
+    sigma_mm = float(np.linalg.norm([border_mm, scatter_mm, bent_mm, region_sigma_mm(region, found)]))
     return Measurand(name="lowest", value=float(end_mm[2]) - 0.5 * bare_mm, sigma=sigma_mm, unit="mm")
 
 
@@ -141,7 +129,8 @@ def _break(region: Region, found: Field) -> Floats:
     return np.asarray(points_mm[apart_mm <= 3.0 * found.spacing_mm])
 
 
-def _sigma_mm(region: Region, found: Field) -> float:
+def region_sigma_mm(region: Region, found: Field) -> float:
+    """Standard uncertainty of a mean distance in the region, as a rule."""
     return float(np.median(found.sigma_mm[region.points]))
 
 
@@ -174,7 +163,7 @@ def edge_loss(region: Region, found: Field, nominal: Nominal, twin: Twin, zone: 
     rows = [_section_loss(float(z_mm), break_mm, nominal, mesh, zone) for z_mm in heights_mm]
     loss_mm, scatter_mm, chord_mm = np.array(rows).T
     worst, shortest = int(np.argmax(loss_mm)), int(np.argmin(chord_mm - loss_mm))
-    common_mm = np.hypot(_sigma_mm(region, found), FRONT * found.spacing_mm)
+    common_mm = np.hypot(region_sigma_mm(region, found), FRONT * found.spacing_mm)
     sigma_mm = [np.hypot(common_mm, scatter_mm[i]) for i in (worst, shortest)]
     return EdgeLoss(
         depth_mm=Measurand(name="depth", value=float(loss_mm[worst]), sigma=float(sigma_mm[0]), unit="mm"),
