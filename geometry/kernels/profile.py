@@ -1,4 +1,4 @@
-"""Points sorted by height, and their projection on stacked section curves."""
+"""Points on stacked section curves: where they project, and what of them belongs to a profile."""
 
 import math
 

@@ -205,8 +205,10 @@ def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty)
     """
     covariance, estimates = uncertainty.covariance, uncertainty.estimates
     sigmas = dict(zip(estimates, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    supports, trusted = definition.supports(), ~profile.open_nodes(margin_mm=_RIM_MM)
     for name in (name for name in estimates if name.endswith(PROFILE_EXTREMES)):
-        sigmas[name] = float(np.hypot(sigmas[name], _flattened_mm(name, profile, definition, estimates)))
+        flat_mm = _flattened_mm(name, estimates[name], profile, supports[name] & trusted)
+        sigmas[name] = float(np.hypot(sigmas[name], flat_mm))
     xy = uncertainty.rows("position_x_mm", "position_y_mm")
     sigmas["position_mm"] = _distance_sigma(estimates, covariance[np.ix_(xy, xy)])
     if "waviness_rms_mm" in estimates:
@@ -220,21 +222,18 @@ def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty)
     return sigmas
 
 
-def _flattened_mm(
-    name: str, profile: Profile, definition: Definition, estimates: Mapping[str, Estimate]
-) -> float:
-    """What smoothing may have taken off an extreme; next to a gap points of its rim do not tell."""
-    node = int(np.argmax(np.abs(estimates[name].gradient)))
-    elsewhere = definition.supports()[name] & ~profile.open_nodes(margin_mm=_RIM_MM)
-    if "_form_" in name:  # distances after the fit are others
-        elsewhere = np.zeros_like(elsewhere)
+def _flattened_mm(name: str, extreme: Estimate, profile: Profile, trusted: Bools) -> float:
+    """What smoothing may have taken off an extreme; points elsewhere tell of it on the `trusted` nodes only.
+
+    Next to a gap those of its rim do not, nor of an extreme after the best fit, whose distances are others.
+    """
     sign = 1.0 if name.endswith("_max_mm") else -1.0
     return flattened_mm(
         sign * profile.deviation_mm,
-        node,
+        int(np.argmax(np.abs(extreme.gradient))),
         sign * profile.left_over_mm,
         profile.left_over_sigma_mm,
-        elsewhere,
+        elsewhere=trusted & ("_form_" not in name),
     )
 
 

@@ -141,23 +141,33 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     keep, knots, fit = robust_fit(band, chart, (low, high), settings)
     close = np.abs(band.z_mm - chart.section_z_mm) <= settings.max_gap_mm / 2.0
     arc = _supporting(chart.arc_at(band.node[close]), keep[close], settings.max_gap_mm)
-    profile = _profile(chart, motion, knots, fit, float(np.median(band.few().sigma_mm)))
     widest = _widest(chart.perimeter_mm, len(arc), settings)
     used = band.z_mm[keep]
-    left_mm, left_sigma_mm = left_over(band, knots, fit, chart)
-    return replace(
-        profile,
+    noise_mm = float(np.sqrt(fit.scale)) * float(np.median(band.few().sigma_mm))
+    curve_mm, columns = _drawn(chart, motion, knots, fit, noise_mm)
+    height_mm = np.full(NODES, chart.section_z_mm)
+    left_over_mm, left_over_sigma_mm = left_over(band, knots, fit, chart)
+    return Profile(
+        chart=chart,
+        curve_mm=curve_mm,
+        deviation_mm=chart.project(np.column_stack([curve_mm, height_mm]))[:, 1],
         gaps=find_gaps(chart, arc, widest),
         zones=cover_zones(chart.curve_mm, chart.side, arc, widest),
+        noise_mm=noise_mm,
         band_mm=(float(used.min()), float(used.max())),
         band_points=len(used),
-        left_over_mm=left_mm,
-        left_over_sigma_mm=left_sigma_mm,
+        knots=knots,
+        fit=fit,
+        columns=columns,
+        left_over_mm=left_over_mm,
+        left_over_sigma_mm=left_over_sigma_mm,
     )
 
 
-def _profile(chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, sigma_mm: float) -> Profile:
-    """The curve of a fit, taken back to where the part is; its gaps are not known yet.
+def _drawn(
+    chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, noise_mm: float
+) -> tuple[Floats, Floats]:
+    """The curve (NODES, 2) of a fit, taken back to where the part is, and the fit's free part at its nodes.
 
     Noise along the surface lifts points off a bent one by half its variance over the radius: taken off again.
     """
@@ -165,24 +175,8 @@ def _profile(chart: Chart, motion: Motion, knots: Knots, fit: SplineFit, sigma_m
     columns = rigid_columns(chart.curve_mm, normals, motion.pivot_mm, np.zeros(NODES))
     height = np.full(NODES, chart.section_z_mm)
     deviation = fit.values(knots.u(np.arange(NODES, dtype=np.float64)), knots.v(height), columns)
-    noise_mm = float(np.sqrt(fit.scale)) * sigma_mm
     deviation = deviation - 0.5 * noise_mm**2 * curvature(chart.curve_mm)
-    curve = motion.do(chart.curve_mm + normals * deviation[:, None])
-    return Profile(
-        chart=chart,
-        curve_mm=curve,
-        deviation_mm=chart.project(np.column_stack([curve, height]))[:, 1],
-        gaps=(),
-        zones=(),
-        noise_mm=noise_mm,
-        band_mm=(chart.section_z_mm, chart.section_z_mm),
-        band_points=0,
-        knots=knots,
-        fit=fit,
-        columns=columns,
-        left_over_mm=np.zeros(NODES),
-        left_over_sigma_mm=np.full(NODES, np.inf),
-    )
+    return motion.do(chart.curve_mm + normals * deviation[:, None]), columns
 
 
 def _widest(perimeter_mm: float, count: int, settings: SectionSettings) -> float:
