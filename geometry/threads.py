@@ -14,7 +14,7 @@ def one_blas_thread(verb: Callable[P, T]) -> Callable[P, T]:
     """The verb with BLAS kept to one thread while it runs.
 
     The matrices here are small: more threads wait for each other actively, and take the cores from the
-    threads that have work. Sums in one order also make the same numbers on every machine.
+    threads that have work. Sums in one order also make the same numbers whatever the number of cores.
     """
 
     @wraps(verb)

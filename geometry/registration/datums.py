@@ -24,6 +24,7 @@ from geometry.registration.fit import (
 from geometry.registration.register import RegisterSettings, mask_damage
 from geometry.registration.uncertainty import certainty, form_covariance
 from geometry.robust import TUKEY, robust_sigma
+from geometry.threads import one_blas_thread
 from geometry.transforms import apply, exp, inverse, log
 from geometry.types import Bools, Cloud, Floats, Measurand, Unit
 
@@ -54,6 +55,7 @@ class DatumSettings:
             raise BadInput(f"datums: {self} asks for too little")
 
 
+@one_blas_thread
 def register_root(
     cloud: Cloud,
     nominal: Nominal,
@@ -69,6 +71,7 @@ def register_root(
     return _register_bands(cloud, nominal, start, (datum_z_mm,), settings, "root")
 
 
+@one_blas_thread
 def register_sections(
     cloud: Cloud,
     nominal: Nominal,
@@ -184,6 +187,7 @@ class _Standing:
     residual_mm: Floats  # of the points about the local surfaces, all together
 
 
+@one_blas_thread
 def register_six_point(
     cloud: Cloud,
     nominal: Nominal,

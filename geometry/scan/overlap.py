@@ -11,6 +11,7 @@ from geometry.robust import spread
 from geometry.scan.calibrate import AxisCalibration
 from geometry.scan.fuse import fuse
 from geometry.scan.surface import local_shape
+from geometry.threads import one_blas_thread
 from geometry.transforms import about_z, apply, exp, inverse
 from geometry.types import Bools, Floats, Ints, View
 
@@ -76,6 +77,7 @@ class _Shared:
         )
 
 
+@one_blas_thread
 def refine_axis(views: Sequence[View], axis: AxisCalibration, sigma_mm: float) -> RefinedAxis:
     """The axis that makes the views agree best where they overlap, within what its calibration says of it.
 
