@@ -32,7 +32,8 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.blade.read import read_nominal
 from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import CoarseSettings, find_pose
 from geometry.registration.fit import Fit, fit_kept, motions

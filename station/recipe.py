@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.blade.read import read_nominal
 from geometry.coverage import CoverageSettings
 from geometry.errors import BadInput
 from geometry.registration.datums import DatumSettings

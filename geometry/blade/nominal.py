@@ -4,11 +4,9 @@ import ctypes
 import sys
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from geometry.blade import outline as outlines
@@ -19,19 +17,16 @@ from geometry.blade.solid import (
     check_solid,
     faces_around,
     facet_bulge_mm,
-    merge_vertices,
     slice_loops,
     solid_normals,
 )
 from geometry.blade.span import airfoil_start_mm, edge_lines, on_line_mm
-from geometry.errors import BadInput, BadMesh
+from geometry.errors import BadInput
 from geometry.kernels.parts import over_parts, threads_for
 from geometry.kernels.triangle import describe_feet, refine_closest
 from geometry.types import Bools, Floats, Ints, Mesh, Zone
 
 ZONE_ORDER: tuple[Zone, ...] = tuple(Zone)
-MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
-ENDINGS = (".stl", ".ply", ".obj", ".3mf")
 CURVE_STEP_MM = 0.05  # a section curve is at least this dense
 CURVE_POINTS = 2000  # and has at least so many points
 SPAN_SLACK = (
@@ -298,46 +293,6 @@ class Nominal:
         side[(te_mm <= self.settings.edge_mm) & (te_mm < le_mm)] = 2
         side[(le_mm <= self.settings.edge_mm) & (le_mm <= te_mm)] = 0
         return side
-
-
-def read_nominal(path: Path, units: Literal["mm", "inch"]) -> Mesh:
-    """The closed, oriented solid in an STL, PLY, OBJ or 3MF file, in mm, its equal vertices made one.
-
-    Raises `BadMesh`, one line that names the file and the fault, for anything else.
-    """
-    try:
-        if path.suffix.lower() not in ENDINGS:
-            raise BadMesh(f"ending {path.suffix!r} is none of {', '.join(ENDINGS)}")
-        if not path.is_file():
-            raise BadMesh("no such file")
-        return read_solid(path, MM_PER_UNIT[units])
-    except BadInput as fault:
-        raise BadMesh(f"{path}: {fault}") from None
-
-
-def read_solid(source: Path | BinaryIO, mm_per_unit: float, kind: str | None = None) -> Mesh:
-    """The closed, oriented solid of a mesh file, in mm; `kind` is the ending of one that is open already.
-
-    Raises `BadMesh`, one line that names the fault.
-    """
-    vertices, faces = _load_triangles(source, kind)
-    mesh = merge_vertices(vertices * mm_per_unit, faces)
-    check_solid(mesh)
-    return mesh
-
-
-def _load_triangles(source: Path | BinaryIO, kind: str | None) -> tuple[Floats, Ints]:
-    try:
-        loaded = trimesh.load_mesh(source, file_type=kind, process=False)
-        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-    except Exception as fault:  # the readers raise whatever a damaged file makes them stumble over
-        raise BadMesh(
-            f"cannot be read: {' '.join(str(fault).split())[:200] or type(fault).__name__}"
-        ) from fault
-    if not np.isfinite(vertices).all():
-        raise BadMesh("has vertices that are not finite")
-    return vertices, faces
 
 
 def prepare_nominal(mesh: Mesh, settings: NominalSettings) -> Nominal:

@@ -7,7 +7,7 @@ import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
-from geometry.blade.nominal import read_solid
+from geometry.blade.read import read_solid
 from geometry.errors import BadInput, BadMesh
 from geometry.types import Mesh
 

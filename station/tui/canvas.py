@@ -94,7 +94,7 @@ class Canvas(Widget):
         self._strips: list[Strip] | None = None
 
     def draw(self, columns: int, rows: int) -> list[Strip]:
-        """Strips for the present size."""
+        """Strips for the present size, which each canvas draws; no ABC beside a widget's metaclass."""
         raise NotImplementedError
 
     def redraw(self) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from geometry.blade.nominal import ZONE_ORDER, NominalSettings, prepare_nominal, read_nominal
+from geometry.blade.nominal import ZONE_ORDER, NominalSettings, prepare_nominal
+from geometry.blade.read import read_nominal
 from geometry.blade.solid import check_solid, volume_mm3
 from geometry.errors import BadInput, BadMesh
 from geometry.types import Mesh, Zone

@@ -8,7 +8,8 @@ import manifold3d
 import numpy as np
 import pytest
 
-from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal, read_nominal
+from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.blade.read import read_nominal
 from geometry.blade.solid import check_solid
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
 from geometry.errors import CannotFitTwin

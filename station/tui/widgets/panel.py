@@ -14,7 +14,7 @@ class Panel(Static):
         self._shown: Text | None = None
 
     def text_of(self, state: ScreenState) -> Text:
-        """What to show for this state."""
+        """What to show for this state, which each panel says: a widget's metaclass leaves no room for ABC."""
         raise NotImplementedError
 
     def show(self, state: ScreenState) -> None:
