@@ -30,7 +30,7 @@ from geometry.registration.uncertainty import certainty
 from geometry.sections.airfoil import SectionSettings, measure_sections
 from geometry.transforms import apply, inverse, log
 from geometry.types import Floats, Measurand
-from simulators.damage_solids import Cut
+from simulators.cutters import Cut
 from simulators.presets import CutMaker, broken_corner, repairable_nick, repairable_pit
 from simulators.sections import SectionTruth
 from simulators.wear import NominalBlade, WornBlade

@@ -29,6 +29,8 @@ CASES: dict[str, tuple[Zone, Callable[[], Any]]] = {
     "edge nick, 1 mm": (Zone.LEADING_EDGE, lambda: blades.edge_nick_cutter(1.0)),
     "edge nick, 2 mm": (Zone.LEADING_EDGE, lambda: blades.edge_nick_cutter(2.0)),
     "edge nick, 3.5 mm": (Zone.LEADING_EDGE, lambda: blades.edge_nick_cutter(3.5, 2.5)),
+    "eroded edge, 0.3 mm": (Zone.LEADING_EDGE, lambda: blades.eroded_edge_cutter(0.3)),
+    "eroded edge, 0.8 mm": (Zone.LEADING_EDGE, lambda: blades.eroded_edge_cutter(0.8)),
 }
 
 

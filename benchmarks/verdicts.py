@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from simulators.blade import Wear
-from simulators.damage_solids import Cut, edge_nick, pit, tip_corner
+from simulators.cutters import Cut, edge_nick, eroded_edge, pit, tip_corner
 from simulators.optics import OpticsSettings
 from simulators.parts import SimPart, assemble
 from simulators.presets import nominal_blade, serial_of
@@ -88,10 +88,13 @@ def random_cuts(worn: WornBlade, rng: np.random.Generator) -> list[Cut]:
     """Each of four kinds of damage with a chance of two in five, in places that do not overlap."""
     depth = {"tip": (0.6, 18.0), "leading": (0.2, 3.0), "trailing": (0.2, 3.0), "pit": (0.15, 2.5)}
     chosen = {kind: logarithmic(rng, *sizes) for kind, sizes in depth.items() if rng.random() < 0.4}
+    eroded = rng.random() < 0.3
     makers = {
         "tip": lambda d: tip_corner(worn.airfoil, d, rng.uniform(0.4, 0.8), rng),
-        "leading": lambda d: edge_nick(
-            worn.airfoil, "leading_edge", rng.uniform(0.25, 0.7), d, 3.0 + 3.0 * d, rng
+        "leading": lambda d: (
+            eroded_edge(worn.airfoil, "leading_edge", (rng.uniform(0.1, 0.3), rng.uniform(0.5, 0.8)), d, rng)
+            if eroded
+            else edge_nick(worn.airfoil, "leading_edge", rng.uniform(0.25, 0.7), d, 3.0 + 3.0 * d, rng)
         ),
         "trailing": lambda d: edge_nick(
             worn.airfoil, "trailing_edge", rng.uniform(0.25, 0.6), d, 3.0 + 3.0 * d, rng

@@ -22,7 +22,8 @@ import numpy as np
 from geometry.damage.damages import DamageKind
 from geometry.errors import CannotMeasure
 from geometry.types import Mesh
-from simulators.damage_solids import DamageTruth, edge_nick, pit, tip_corner, tip_loss
+from simulators.cutters import edge_nick, pit, tip_corner, tip_loss
+from simulators.damage_solids import DamageTruth
 from simulators.presets import nominal_blade
 from tests.geometry.captures import Cutter, Inspected, capture, inspect, nominal_of
 

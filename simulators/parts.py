@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from simulators.damage_solids import Cut, DamageTruth, break_off
+from simulators.cutters import Cut
+from simulators.damage_solids import DamageTruth, break_off
 from simulators.optics import OpticsSettings, StructuredLight
 from simulators.recipe import Finding, decide, findings, recipe_of
 from simulators.rig import Rig, inverse

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from simulators.blade import BladeShape, Wear, blade_solid
-from simulators.damage_solids import Cut, edge_nick, pit, tip_corner
+from simulators.cutters import Cut, edge_nick, pit, tip_corner
 from simulators.optics import BlindSpot, OpticsSettings
 from simulators.parts import PEDESTAL_MM, SimPart, assemble, clamped
 from simulators.preset_names import DEMO, preset_named

@@ -15,6 +15,7 @@ NEIGHBOURS = 8  # of a point, which tell how deep the break is there
 LIKELY = 0.7  # mean depth of the neighbours, in films, at which a point below the skin lies on the break
 CERTAIN = 2.0  # own depth in films that needs no neighbours but two
 NEAR_SKIN_MM = 0.5  # farther off, a point that no damage claims is none of the blade's
+SMOOTH = 0.97  # cosine between break and skin from which on the one runs out into the other
 SUPPORT = 2.5  # skin farther than this many point spacings from every sound point is lost or unseen
 
 
@@ -84,9 +85,9 @@ def find_broken_surface(
         raise CannotRepair(f"{deep.sum()} scan points lie provably below the twin, {min_points} are needed")
     raw_mm, sigma_mm = scan.points_mm[near[deep]], float(np.median(scan.sigma_mm[near[deep]]))
     sound_mm = _sound_points(scan, near[~deep], raw_mm)
-    points_mm, frames, bending = local_quadrics(thinned(raw_mm, 6.0 * sigma_mm))
+    points_mm, frames, bending = _shape(skin, thinned(raw_mm, 6.0 * sigma_mm), sound_mm, 3.0 * pitch_mm)
     spacing_mm = spacings_mm(points_mm)
-    lost_pitch_mm = float(np.clip(np.sqrt((spacing_mm**2).sum()) / 15.0, 0.1, 1.0))
+    lost_pitch_mm = _lost_pitch(skin, points_mm, spacing_mm)
     support_mm = min(SUPPORT * pitch_mm, 0.5 * max_gap_mm)
     lost_mm, lost_normals = _lost_skin(skin, raw_mm, sound_mm, lost_pitch_mm, support_mm)
     inward = outward_sign(points_mm, frames[:, 2], lost_mm, lost_normals) < 0.0
@@ -142,6 +143,24 @@ def _sound_points(scan: Scan, shallow: Ints, raw_mm: Floats) -> Floats:
     sound[shallow] = True
     boxed = ((scan.points_mm >= low) & (scan.points_mm <= high)).all(axis=1)
     return scan.points_mm[sound & boxed]
+
+
+def _shape(skin: Skin, break_mm: Floats, sound_mm: Floats, reach_mm: float) -> tuple[Floats, Floats, Floats]:
+    """The quadrics of the break. Where it runs out smoothly into the skin, sound points help to tell them."""
+    alone = local_quadrics(break_mm, break_mm)
+    beside_mm = sound_mm[_within(sound_mm, break_mm, reach_mm)]
+    if not len(beside_mm):
+        return alone
+    normals = skin.normals[skin.closest(beside_mm)[2]]
+    of_break = alone[1][cKDTree(break_mm).query(beside_mm)[1], 2]
+    smooth = np.abs((normals * of_break).sum(axis=1)) > SMOOTH
+    return local_quadrics(break_mm, np.concatenate([break_mm, beside_mm[smooth]]))
+
+
+def _lost_pitch(skin: Skin, points_mm: Floats, spacing_mm: Floats) -> float:
+    """How densely to sample the lost skin: finer than the break is wide, and than it lies deep."""
+    depth_mm = float(np.median(-skin.closest(points_mm)[0]))
+    return float(np.clip(min(np.sqrt((spacing_mm**2).sum()) / 15.0, depth_mm), 0.1, 1.0))
 
 
 def _lost_skin(

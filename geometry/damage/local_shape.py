@@ -32,13 +32,13 @@ def thinned(points_mm: Floats, cell_mm: float) -> Floats:
     return np.column_stack(sums) / count[:, None]
 
 
-def local_quadrics(points_mm: Floats) -> tuple[Floats, Floats, Floats]:
-    """Feet (n, 3), frames (n, 3, 3) and bending (n, 3) of least-squares quadrics at the points.
+def local_quadrics(at_mm: Floats, points_mm: Floats) -> tuple[Floats, Floats, Floats]:
+    """Feet (n, 3), frames (n, 3, 3) and bending (n, 3) of least-squares quadrics of the points (m, 3).
 
     The first frame is the principal axes of the neighbours, the second the quadric's own tangent plane.
     """
-    distance_mm, index = cKDTree(points_mm).query(points_mm, min(FIT_POINTS, len(points_mm)))
-    off = points_mm[index] - points_mm[:, None]
+    distance_mm, index = cKDTree(points_mm).query(at_mm, min(FIT_POINTS, len(points_mm)))
+    off = points_mm[index] - at_mm[:, None]
     weight = np.maximum(1.0 - (distance_mm / (1.2 * distance_mm[:, -1:])) ** 2, 0.0) ** 2
     mean = (weight[..., None] * off).sum(axis=1, keepdims=True) / weight.sum(axis=1)[:, None, None]
     spread = np.einsum("nk,nki,nkj->nij", weight, off - mean, off - mean)
@@ -50,7 +50,7 @@ def local_quadrics(points_mm: Floats) -> tuple[Floats, Floats, Floats]:
         ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
         right = np.einsum("nk,nki,nk->ni", weight, design, height)
         fit = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
-        feet_mm = points_mm + fit[:, :1] * frames[:, 2]
+        feet_mm = at_mm + fit[:, :1] * frames[:, 2]
         frames = _tilted(frames, fit[:, 1:3])
     return feet_mm, frames, fit[:, 3:]
 

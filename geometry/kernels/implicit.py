@@ -57,6 +57,7 @@ def blend_quadrics(
     reach2 = reach_mm * reach_mm
     for p in range(len(points_mm)):
         width2 = width_mm[p] * width_mm[p]
+        bent2 = bending[p, 0] ** 2 + 2.0 * bending[p, 1] ** 2 + bending[p, 2] ** 2
         x0 = (points_mm[p, 0] - origin_mm[0]) / step_mm
         y0 = (points_mm[p, 1] - origin_mm[1]) / step_mm
         z0 = (points_mm[p, 2] - origin_mm[2]) / step_mm
@@ -85,6 +86,8 @@ def blend_quadrics(
                     far2 = (u * u + v * v) / (2.25 * width2)
                     if far2 > 1.0:  # a quadric is not to be trusted far beyond the points that made it
                         sag /= far2
+                    if sag * sag * bent2 > 1.0:  # nor does a round fall by more than its radius
+                        sag = np.copysign(1.0 / np.sqrt(bent2), sag)
                     w = width2 * np.exp(-exponent)
                     weighted[i, j, k] += w * (n - sag)
                     weight[i, j, k] += w

@@ -13,14 +13,16 @@ from geometry.types import Floats
 RIM_FACING = 0.3  # least cosine to the way out of skin on which the columns may stand
 LEAST_FACING = 0.15  # of the mean normal of a break that columns can measure
 COLUMNS = 40_000  # over the box of the damage
+NEAREST = 16  # points that tell how high the break lies in a column
+RIDGE = (1e-9, 1e-9, 1e-9, 1e-3, 1e-3, 1e-3)  # how far a plane is preferred where few points tell a bend
 
 
 def volume_by_columns(broken: BrokenSurface, skin: Skin) -> float:
     """The lost volume (mm3) by another way: columns along the way out, from scan points to the twin's skin.
 
-    Uses neither fitted quadrics nor the implicit surface nor the mesh of the patch: a column ends on a plane
-    through the nearest scan points in projection, of the break and of those of its rim that face the same
-    way; it counts where it leaves the twin through lost skin or just beside it.
+    Uses neither the local shape of the break nor the implicit surface nor the mesh of the patch: a column
+    ends on a quadric through the nearest scan points in projection, of the break and of those of its rim
+    that face the same way; it counts where it leaves the twin through lost skin or just beside it.
     """
     facing = float(np.linalg.norm(broken.facing))
     if not facing > LEAST_FACING:
@@ -45,13 +47,17 @@ def volume_by_columns(broken: BrokenSurface, skin: Skin) -> float:
 
 
 def _heights(at_mm: Floats, points_mm: Floats) -> Floats:
-    """Height (n,) over each place (n, 2) of a weighted plane through the ten points nearest in projection."""
-    near = np.arange(1, min(10, len(points_mm)) + 1)
+    """Height (n,) over each place (n, 2) of a weighted quadric through the points nearest in projection.
+
+    Between the points of a rounded edge a plane would cut the corner.
+    """
+    near = np.arange(1, min(NEAREST, len(points_mm)) + 1)
     distance_mm, index = cKDTree(points_mm[:, :2]).query(at_mm, near)
-    weight = 1.0 / (distance_mm**2 + 1e-2 * distance_mm[:, -1:] ** 2)
-    off = points_mm[index, :2] - at_mm[:, None]
-    design = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
+    reach_mm = distance_mm[:, -1:]
+    weight = 1.0 / ((distance_mm / reach_mm) ** 2 + 1e-2)
+    u, v = np.moveaxis((points_mm[index, :2] - at_mm[:, None]) / reach_mm[..., None], 2, 0)
+    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
     normal = np.einsum("nk,nki,nkj->nij", weight, design, design)
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    normal += np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.diag(RIDGE)
     right = np.einsum("nk,nki,nk->ni", weight, design, points_mm[index, 2])
     return np.asarray(np.linalg.solve(normal, right[..., None])[:, 0, 0])

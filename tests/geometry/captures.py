@@ -22,7 +22,7 @@ from geometry.scan.overlap import refine_axis
 from geometry.transforms import apply, inverse
 from geometry.types import Bools, Cloud, Floats, Mesh, View
 from simulators.calibration_file import SIGMA_AXIS_OFFSET_MM, SIGMA_AXIS_TILT_DEG, calibrated_axis
-from simulators.damage_solids import Cut
+from simulators.cutters import Cut
 from simulators.optics import OpticsSettings
 from simulators.parts import SimPart, assemble
 from simulators.presets import rig_of, service_wear

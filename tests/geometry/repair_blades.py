@@ -205,6 +205,22 @@ def edge_nick_cutter(
     return round_file.translate(tuple(edge + (depth_mm - radius_mm) * inward))
 
 
+def eroded_edge_cutter(
+    depth_mm: float = 0.4, radius_mm: float = 1.5, half_mm: float = 13.0
+) -> manifold3d.Manifold:
+    """Wears the leading edge back over 24 mm of the span, evenly, to a blunter round."""
+    z_mm, n = 0.5 * SPAN_MM, 240
+    low, high = leading_edge_at(z_mm - 5.0), leading_edge_at(z_mm + 5.0)
+    along = (high - low) / np.linalg.norm(high - low)
+    across = np.cross(leading_edge_at(z_mm) - trailing_edge_at(z_mm), along)
+    across /= np.linalg.norm(across)
+    R = np.column_stack([along, across, np.cross(along, across)])
+    u = np.linspace(-half_mm, half_mm, n + 1)
+    grid = np.stack(np.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2)
+    height = -depth_mm * (1.0 - 1.2 * (grid[:, 0] / half_mm) ** 4) - grid[:, 1] ** 2 / (2.0 * radius_mm)
+    return _column_solid(grid, np.maximum(height, -CHORD_MM / 4), half_mm, n, R, leading_edge_at(z_mm))
+
+
 @dataclass(frozen=True)
 class Specimen:
     """A damaged blade, its truth, and its scan in the nominal frame."""

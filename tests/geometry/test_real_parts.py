@@ -11,7 +11,7 @@ from geometry.scan.clean import clean
 from geometry.scan.fuse import fuse
 from geometry.transforms import apply, inverse
 from geometry.types import Zone
-from simulators.damage_solids import Cut, edge_nick, pit
+from simulators.cutters import Cut, edge_nick, pit
 from simulators.recipe import SIGMA_MM
 from simulators.solids import loop_area_mm2, slice_loops, to_manifold
 from simulators.wear import WornBlade

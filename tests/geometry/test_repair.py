@@ -32,6 +32,7 @@ CUTTERS = {
     "pit": (Zone.SURFACE, blades.pit_cutter),
     "shallow dent": (Zone.SURFACE, blades.dent_cutter),
     "edge nick": (Zone.LEADING_EDGE, blades.edge_nick_cutter),
+    "eroded edge": (Zone.LEADING_EDGE, blades.eroded_edge_cutter),
 }
 
 

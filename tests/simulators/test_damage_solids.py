@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 
 from simulators.airfoils import Airfoil, find_airfoil
 from simulators.blade import BladeShape, blade_solid
-from simulators.damage_solids import Cut, break_off, edge_nick, pit, tip_corner, tip_loss
+from simulators.cutters import Cut, edge_nick, eroded_edge, pit, tip_corner, tip_loss
+from simulators.damage_solids import break_off
 from simulators.solids import Floats, NotASolid, Solid, loop_area_mm2, slice_loops, to_manifold
 
 LENGTH_MM, HALF_CHORD_MM = 60.0, 15.0
@@ -92,6 +93,20 @@ def test_the_depth_of_a_nick_is_how_far_the_edge_went_back(zone: str, sign: floa
     assert truth.depth_mm == pytest.approx(max(edges) + HALF_CHORD_MM, abs=0.02)
     assert truth.depth_mm == pytest.approx(1.5, abs=0.15)
     assert truth.z_high_mm - truth.z_low_mm == pytest.approx(6.0, abs=0.6)
+
+
+@pytest.mark.parametrize(("zone", "sign"), [("leading_edge", 1.0), ("trailing_edge", -1.0)])
+def test_an_eroded_edge_goes_back_evenly_and_runs_out_at_both_ends(zone: str, sign: float) -> None:
+    airfoil = prism()
+    cut = eroded_edge(airfoil, zone, (0.2, 0.8), 0.6, rng())  # type: ignore[arg-type]
+    after, (truth,) = break_off(airfoil, [cut])
+    heights = np.linspace(14.5, 48.5, 35)
+    lost = np.array([(sign * slice_loops(after, float(z))[0][:, 0]).min() for z in heights]) + HALF_CHORD_MM
+    assert lost[10:-10] == pytest.approx(0.6, abs=0.1)
+    assert lost[[0, -1]] == pytest.approx(0.0, abs=0.15)
+    assert truth.depth_mm == pytest.approx(lost.max(), abs=0.03)
+    assert np.abs(np.diff(lost)).max() < 0.15
+    assert truth.z_high_mm - truth.z_low_mm == pytest.approx(0.58 * (LENGTH_MM - 3.0), abs=1.5)
 
 
 def test_the_depth_of_a_pit_is_normal_to_the_surface() -> None:
