@@ -9,8 +9,9 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
 from geometry.damage.bends import BendSettings, bend_depth, bent_pairs
-from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, normal_depth, span_depth
+from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, span_depth
 from geometry.damage.detection import edge_limit_mm, tip_limit_mm
+from geometry.damage.normal_depth import normal_depth
 from geometry.damage.regions import (
     Field,
     Region,
@@ -152,7 +153,7 @@ def _loss(
         return edge_loss(region, found, nominal, twin, zone)
     if region.missing and zone is Zone.TIP:
         return EdgeLoss(depth_mm=_tip_depth(lowest, found, nominal), remaining_chord_mm=NOT_AN_EDGE)
-    return EdgeLoss(depth_mm=normal_depth(region, found), remaining_chord_mm=NOT_AN_EDGE)
+    return EdgeLoss(depth_mm=normal_depth(region, found, nominal, twin), remaining_chord_mm=NOT_AN_EDGE)
 
 
 def _tip_depth(lowest: Measured, found: Field, nominal: Nominal) -> Measured:

@@ -1,4 +1,4 @@
-"""How deep a damage is: along the span at the tip, along the chord at an edge, else normal to the twin."""
+"""How deep a damage of tip or edge is: along the span at the tip, along the chord at an edge."""
 
 from dataclasses import dataclass
 
@@ -30,34 +30,6 @@ class EdgeLoss:
 
     depth_mm: Measured
     remaining_chord_mm: Measured
-
-
-def normal_depth(region: Region, found: Field) -> Measurand:
-    """The largest distance normal to the twin.
-
-    The mean over a neighbourhood tells where the bottom is, and flattens it; how deep it is tells the quadric
-    through the points around.
-    """
-    deepest = region.points[int(np.argmax(np.abs(found.smooth_mm[region.points])))]
-    around = found.neighbours[deepest]
-    around = around[around >= 0]
-    off_mm = found.scan_mm[around] - found.scan_mm[deepest]
-    across, along = np.linalg.eigh(off_mm.T @ off_mm)[1][:, :0:-1].T
-    depth_mm = np.abs(found.height_mm[around])
-    fitted_mm, sagitta_mm = _bottom(off_mm @ across, off_mm @ along, depth_mm, found.spacing_mm)
-    scatter_mm = float(np.std(depth_mm - fitted_mm))
-    sigma_mm = float(np.linalg.norm([found.sigma_mm[deepest], 0.5 * scatter_mm, sagitta_mm]))
-    return Measurand(name="depth", value=float(fitted_mm.max()), sigma=sigma_mm, unit="mm")
-
-
-def _bottom(u_mm: Floats, v_mm: Floats, depth_mm: Floats, spacing_mm: float) -> tuple[Floats, float]:
-    """Depths (n,) on the full quadric through points, and how far it bends from one point to the next."""
-    terms = np.stack([np.ones_like(u_mm), u_mm, v_mm, u_mm**2, u_mm * v_mm, v_mm**2], axis=1)
-    coefficients = np.linalg.lstsq(terms, depth_mm, rcond=1e-6)[0]
-    bend_per_mm = np.linalg.norm(
-        [2.0 * coefficients[3], 2.0 * coefficients[5], np.sqrt(2.0) * coefficients[4]]
-    )
-    return np.asarray(terms @ coefficients), float(bend_per_mm) * spacing_mm**2 / np.sqrt(8.0)
 
 
 def span_depth(tip_mm: float, lowest: Measured) -> Measured:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geometry.blade.nominal import UP
 from geometry.errors import BadInput
 from geometry.kernels.form import blend, local_fits
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean, neighbourhood_median
@@ -19,6 +20,7 @@ CELL = 1.6  # edge of a cell of the nodes, as wide as most of these reach and a 
 IRLS_STEPS = 4
 RIDGE = 1e-3  # flat surfaces do not tell all motions
 REACHES = 6
+LIDS = 10  # part of the points for the form, at least, that may lie on end faces
 MEDIAN = 1.25  # a median scatters so much more than a mean
 
 
@@ -78,7 +80,7 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
     more, the fits reach out until no more points join.
     """
     place = np.column_stack([points_mm, TURN_MM * normals])
-    few = _every_nth(len(points_mm), settings.form_points)
+    few = _sampled(normals, settings)
     limit_mm = max(settings.form_mm, 4.0 * robust_sigma(distance_mm))
     near = np.abs(distance_mm[few]) <= limit_mm
     for _ in range(REACHES):
@@ -95,6 +97,13 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
         if np.array_equal(before, near):
             break
     return _blend(points_mm, normals, points_mm[nodes], normals[nodes], fits)
+
+
+def _sampled(normals: Floats, settings: MaskSettings) -> Ints:
+    """Indices of points evenly through all, and of more of them on end faces: these are small, and hold z."""
+    some = _every_nth(len(normals), settings.form_points)
+    lid = np.flatnonzero(np.abs(normals[:, 2]) > UP)
+    return np.union1d(some, lid[_every_nth(len(lid), settings.form_points // LIDS)])
 
 
 def _clear(place: Floats, near: Bools, rim_mm: float) -> Bools:
