@@ -11,6 +11,8 @@ from math import isfinite
 import manifold3d
 import numpy as np
 import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from simulators.airfoils import Airfoil, airfoil_loop
@@ -110,13 +112,33 @@ def _edge_loss_mm(airfoil: Airfoil, zone: ZoneName, after: Solid, z_mm: float) -
 
 
 def _normal_depth_mm(skin_mm: Floats, fracture_mm: Floats) -> float:
-    """From the lost skin (m, 3, 3), the distance of the fracture point that is farthest from it."""
+    """From the lost skin (m, 3, 3), the distance of the fracture point that is farthest from it; where the
+    metal is pierced, from the skin of the side that is farther."""
+    return max(_depth_below_mm(skin_mm[side], fracture_mm) for side in _pieces(skin_mm))
+
+
+def _pieces(triangles_mm: Floats) -> list[Ints]:
+    """The triangles (m, 3, 3) that hang together at their corners."""
+    _, corner = np.unique(triangles_mm.reshape(-1, 3).round(6), axis=0, return_inverse=True)
+    corner = corner.reshape(-1, 3)
+    pairs = (corner.ravel(), np.roll(corner, 1, axis=1).ravel())
+    graph = coo_array((np.ones(corner.size), pairs), shape=(corner.max() + 1,) * 2)
+    piece = connected_components(graph, directed=False)[1][corner[:, 0]]
+    return [np.flatnonzero(piece == index) for index in np.unique(piece)]
+
+
+def _depth_below_mm(skin_mm: Floats, fracture_mm: Floats) -> float:
+    """Along the normal of the skin next to it: beside the rim a point is far from the skin, but not deep."""
     rough = cKDTree(skin_mm.mean(axis=1)).query(fracture_mm)[0]
     deepest = fracture_mm[np.argsort(-rough)[:DEEPEST]]
     pairs = np.repeat(skin_mm[None], len(deepest), axis=0).reshape(-1, 3, 3)
     points = np.repeat(deepest, len(skin_mm), axis=0)
-    gaps = np.linalg.norm(trimesh.triangles.closest_point(pairs, points) - points, axis=1)
-    return float(gaps.reshape(len(deepest), -1).min(axis=1).max())
+    gaps = (trimesh.triangles.closest_point(pairs, points) - points).reshape(len(deepest), -1, 3)
+    nearest = np.linalg.norm(gaps, axis=2).argmin(axis=1)
+    a, b, c = np.moveaxis(skin_mm[nearest], 1, 0)
+    normals = np.cross(b - a, c - a)
+    along = (gaps[np.arange(len(deepest)), nearest] * normals).sum(axis=1)
+    return float(np.abs(along / np.linalg.norm(normals, axis=1)).max())
 
 
 def _area_mm2(triangles_mm: Floats) -> float:

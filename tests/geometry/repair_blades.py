@@ -184,6 +184,13 @@ def pit_cutter(depth_mm: float = 1.2, radius_mm: float = 3.0, share: float = 0.4
     return ball.translate(tuple(at + (radius_mm - depth_mm) * normal))
 
 
+def hole_cutter(radius_mm: float = 1.5, share: float = 0.45) -> manifold3d.Manifold:
+    """A drill through the blade from the pressure side."""
+    at, normal = pressure_side_at(share, 0.55 * SPAN_MM)
+    drill = manifold3d.Manifold.cylinder(24.0, radius_mm, radius_mm, 160, True)
+    return drill.transform(np.column_stack([frame_with_z(normal), at]))
+
+
 def dent_cutter(depth_mm: float = 0.8, width_mm: float = 1.6, share: float = 0.4) -> manifold3d.Manifold:
     """A smooth hollow whose rim runs out tangentially into the suction side."""
     at, normal = suction_side_at(share, 0.5 * SPAN_MM)

@@ -18,7 +18,10 @@ CUTTERS = {
     "tip corner": (Zone.TIP, lambda: blades.tip_corner_cutter(8.0, 0.1)),
     "edge nick": (Zone.LEADING_EDGE, blades.edge_nick_cutter),
     "pit": (Zone.SURFACE, blades.pit_cutter),
+    "deep pit": (Zone.SURFACE, lambda: blades.pit_cutter(DEEP_MM, 3.5)),
+    "hole": (Zone.SURFACE, blades.hole_cutter),
 }
+DEEP_MM = 3.0  # more than half of the metal's thickness
 
 
 @cache
@@ -75,7 +78,7 @@ def truth(name: str) -> float:
     return edge_truth()[0] if name == "edge nick" else 1.2
 
 
-@pytest.mark.parametrize("name", list(CUTTERS))
+@pytest.mark.parametrize("name", ["tip corner", "edge nick", "pit"])
 def test_the_depth_is_unbiased_from_dense_to_thin_scans(name: str) -> None:
     for per_mm2 in DENSITIES:
         depths = [number(one(name, per_mm2, seed).depth_mm) for seed in range(4)]
@@ -85,6 +88,22 @@ def test_the_depth_is_unbiased_from_dense_to_thin_scans(name: str) -> None:
         assert (np.abs(errors_mm) <= 3.0 * sigmas_mm).all()
         assert abs(errors_mm.mean()) <= 0.5 * spacing_mm + 0.03
         assert sigmas_mm.max() <= spacing_mm
+
+
+@pytest.mark.parametrize("per_mm2", [60.0, 25.0])
+def test_a_pit_is_as_deep_as_it_was_cut_where_the_other_side_is_nearer(per_mm2: float) -> None:
+    _, normal = blades.pressure_side_at(0.45, 0.55 * blades.SPAN_MM)
+    thick_mm = float(np.ptp(blades.mesh_of(lost("hole")).vertices_mm @ normal))
+    assert 0.6 * thick_mm < DEEP_MM
+    depth = number(one("deep pit", per_mm2, 0).depth_mm)
+    assert depth.value == pytest.approx(DEEP_MM, abs=3.0 * depth.sigma + 0.02)
+
+
+@pytest.mark.parametrize("per_mm2", [60.0, 25.0])
+def test_a_hole_is_as_deep_as_the_metal_is_thick(per_mm2: float) -> None:
+    _, normal = blades.pressure_side_at(0.45, 0.55 * blades.SPAN_MM)
+    thick_mm = float(np.ptp(blades.mesh_of(lost("hole")).vertices_mm @ normal))
+    assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thick_mm, rel=0.06)
 
 
 def test_a_rough_break_is_as_deep_as_it_is_told_within_its_uncertainty() -> None:

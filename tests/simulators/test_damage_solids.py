@@ -120,6 +120,14 @@ def test_the_depth_of_a_pit_is_normal_to_the_surface() -> None:
     assert truth.centroid_mm[1] < 1.0  # on the hollow side
 
 
+def test_a_hole_is_as_deep_as_the_metal_is_thick() -> None:
+    airfoil = prism()
+    _, (truth,) = break_off(airfoil, [pit(airfoil, 0.5, 0.5, 9.0, 5.0, rng())])
+    loop = slice_loops(airfoil.solid, 30.0)[0]
+    middle = loop[np.abs(loop[:, 0]) < 0.3]
+    assert truth.depth_mm == pytest.approx(np.ptp(middle[:, 1]), rel=0.15)
+
+
 def test_equal_seeds_break_alike_and_others_do_not() -> None:
     airfoil = prism()
     made = [break_off(airfoil, [pit(airfoil, 0.5, 0.5, 0.8, 2.5, rng(seed))])[1][0] for seed in (3, 3, 4)]
