@@ -42,7 +42,7 @@ def form_covariance(nominal: Nominal, moved_mm: Floats, found: Closest) -> Float
     left_mm = found.distance_mm[few] - pose @ (pose.T @ found.distance_mm[few])
     spread = np.zeros((6, 6))
     for shape, chordwise, spanwise in _patterns(nominal, feet_mm, normals):
-        spread += _leaked(left_mm * shape, pose * shape[:, None], chordwise, spanwise)
+        spread += _leaked(left_mm, pose, shape[:, None] * chordwise, spanwise)
     bulge = pose.T @ nominal.bulge_mm[found.face[few]]
     spread += np.outer(bulge, bulge)
     back = whiten * scale[:, None]
