@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
+from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.errors import BadInput
 from geometry.kernels.neighbours import k_nearest
 from geometry.registration.mask import MaskSettings, damaged, form_of
+from geometry.registration.register import mask_damage
 from geometry.robust import robust_sigma
+from geometry.types import Cloud
+from tests.geometry import blades
+from tests.geometry.poses import in_place
 
 
 def plate(rng, sigma_mm):
@@ -88,3 +93,19 @@ def test_form_of_a_surface_that_is_nowhere_near_is_nothing():
 def test_settings_that_contradict_themselves_are_refused(wrong):
     with pytest.raises(BadInput, match="mask"):
         MaskSettings(**wrong)
+
+
+def test_the_form_of_a_small_end_face_is_not_taken_for_damage():
+    """Three waves along a tip face that a break has left half of; it may be all that holds the height."""
+    blade, rng = blades.Blade(), np.random.default_rng(6)
+    scan = blades.with_tip_cut(blades.scan(blade, 6.5, rng), blade, 28.0, rng, 1.1)
+    wave_mm = 0.03 * np.sin(2.0 * np.pi * 3.0 * scan.points_mm[:, 0] / blade.chord_mm)
+    points_mm = scan.points_mm + wave_mm[:, None] * scan.normals
+    settings = NominalSettings(z_min_mm=0.0, z_max_mm=blade.height_mm)
+    count = len(points_mm)
+    cloud = Cloud(points_mm=points_mm, sigma_mm=np.full(count, 0.001), view=np.zeros(count, np.int64))
+    flags = mask_damage(cloud, in_place(), prepare_nominal(blades.mesh(blade), settings))
+    sound = (scan.depth_mm == 0.0) & (scan.normals[:, 2] > 0.9)
+    assert sound.sum() > 100
+    assert flags[sound].mean() < 0.15
+    assert flags[scan.depth_mm > 0.1].mean() > 0.98
