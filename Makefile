@@ -58,6 +58,7 @@ bench-parts: setup  ## whole parts from views to patches: occlusion, real blades
 
 bench-verdicts: setup  ## the whole product from files: verdicts of random parts against the truth; none may be wrong
 	$(BIN)/python -m benchmarks.verdicts 20
+	$(BIN)/python -m benchmarks.verdicts 6 --real
 
 campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenario, all seeds of the twin
 	$(BIN)/python -m benchmarks.registration --full
@@ -68,6 +69,7 @@ campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenar
 	$(BIN)/python -m benchmarks.twin_peers --full
 	$(BIN)/python -m benchmarks.views 5
 	$(BIN)/python -m benchmarks.verdicts 300
+	$(BIN)/python -m benchmarks.verdicts 60 --real
 
 picture: setup  ## redraw the picture of the screen in the README
 	$(BIN)/python -m tests.station.tui.picture docs/screen.png

@@ -1,6 +1,6 @@
 """Verdicts of the whole product against the truth: random parts, scanned, inspected from their files.
 
-    python -m benchmarks.verdicts [parts] [first seed]
+    python -m benchmarks.verdicts [parts] [first seed] [--real]
 
 Each part is a blade worn at random, from half to three times what the presets allow, with up to three
 damages whose sizes are drawn on a logarithmic scale across both limits of their zone, so that many true
@@ -8,11 +8,15 @@ values lie near a limit. Twelve views with a calibrated axis are merged, written
 `station.inspect` as a file from anywhere would be. The truth is what a perfect measurement would decide;
 where the scan has a larger gap than the plan allows, it is SCRAP or HOLD.
 
+With `--real` the nominals are a turbine blade and two compressor rows in turn, where their geometry is
+here; sizes go with the chord.
+
 HOLD is always allowed: near a limit it is the only honest word. Its reasons are listed, with how far the
 truth lies from the limit that it is nearest to, in shares of that limit. Any other word that is not the
 truth is wrong, and there must be none.
 """
 
+import argparse
 import sys
 import tempfile
 import time
@@ -27,10 +31,12 @@ from simulators.cutters import Cut, edge_nick, eroded_edge, pit, tip_corner
 from simulators.optics import OpticsSettings
 from simulators.parts import SimPart, assemble
 from simulators.presets import nominal_blade, serial_of
+from simulators.recipe import recipe_of
 from simulators.solids import NotASolid
 from simulators.synth import write_scanned
 from simulators.wear import NominalBlade, WornBlade, worn_blade
 from station.inspect import inspect_scan
+from tests.geometry import real_parts as real
 
 VIEWS = 12
 WORDS = ("PASS", "REPAIR", "SCRAP", "HOLD")
@@ -56,13 +62,14 @@ class Judged:
 def random_part(blade: NominalBlade, seed: int) -> SimPart:
     """A part with wear and damages of any size that a plan is about."""
     rng = np.random.default_rng([seed, 11])
-    worn = worn_blade(blade, random_wear(rng))
+    size = recipe_of(blade).scale
+    worn = worn_blade(blade, random_wear(rng, size))
     while True:
         try:
             return assemble(
                 blade,
                 worn,
-                random_cuts(worn, rng),
+                random_cuts(worn, rng, size),
                 preset="random",
                 serial=serial_of(seed, 0),
                 seed=seed,
@@ -73,34 +80,34 @@ def random_part(blade: NominalBlade, seed: int) -> SimPart:
             continue
 
 
-def random_wear(rng: np.random.Generator) -> Wear:
-    size = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
+def random_wear(rng: np.random.Generator, size: float) -> Wear:
+    much = np.exp(rng.uniform(np.log(0.5), np.log(3.0)))
     return Wear(
         wave_mm=0.005,
-        bump_mm=float(0.06 * size),
-        bend_mm=float(rng.uniform(-0.08, 0.08) * size),
-        untwist_deg=float(rng.uniform(-0.15, 0.15) * size),
+        bump_mm=float(0.06 * much * size),
+        bend_mm=float(rng.uniform(-0.08, 0.08) * much * size),
+        untwist_deg=float(rng.uniform(-0.15, 0.15) * much),
         seed=int(rng.integers(2**31)),
     )
 
 
-def random_cuts(worn: WornBlade, rng: np.random.Generator) -> list[Cut]:
+def random_cuts(worn: WornBlade, rng: np.random.Generator, size: float) -> list[Cut]:
     """Each of four kinds of damage with a chance of two in five, in places that do not overlap."""
     depth = {"tip": (0.6, 18.0), "leading": (0.2, 3.0), "trailing": (0.2, 3.0), "pit": (0.15, 2.5)}
-    chosen = {kind: logarithmic(rng, *sizes) for kind, sizes in depth.items() if rng.random() < 0.4}
+    chosen = {kind: size * logarithmic(rng, *range_) for kind, range_ in depth.items() if rng.random() < 0.4}
     eroded = rng.random() < 0.3
     makers = {
         "tip": lambda d: tip_corner(worn.airfoil, d, rng.uniform(0.4, 0.8), rng),
         "leading": lambda d: (
             eroded_edge(worn.airfoil, "leading_edge", (rng.uniform(0.1, 0.3), rng.uniform(0.5, 0.8)), d, rng)
             if eroded
-            else edge_nick(worn.airfoil, "leading_edge", rng.uniform(0.25, 0.7), d, 3.0 + 3.0 * d, rng)
+            else edge_nick(worn.airfoil, "leading_edge", rng.uniform(0.25, 0.7), d, 3.0 * size + 3.0 * d, rng)
         ),
         "trailing": lambda d: edge_nick(
-            worn.airfoil, "trailing_edge", rng.uniform(0.25, 0.6), d, 3.0 + 3.0 * d, rng
+            worn.airfoil, "trailing_edge", rng.uniform(0.25, 0.6), d, 3.0 * size + 3.0 * d, rng
         ),
         "pit": lambda d: pit(
-            worn.airfoil, rng.uniform(0.25, 0.7), rng.uniform(0.4, 0.6), d, 1.5 + 2.0 * d, rng
+            worn.airfoil, rng.uniform(0.25, 0.7), rng.uniform(0.4, 0.6), d, 1.5 * size + 2.0 * d, rng
         ),
     }
     return [makers[kind](depth_mm) for kind, depth_mm in chosen.items()]
@@ -149,16 +156,29 @@ def show(parts: list[Judged]) -> None:
     print(f"{len(wrong)} wrong of {len(parts)}; {np.mean([part.seconds for part in parts]):.1f} CPU s a part")
 
 
+def nominals(real_parts: bool) -> list[NominalBlade]:
+    """The part numbers whose parts take turns."""
+    if not real_parts:
+        return [nominal_blade(None)]
+    return list(real.part_numbers().values()) if real.present() else []
+
+
 def main() -> int:
     """How many verdicts were wrong."""
-    parts = int(sys.argv[1]) if len(sys.argv) > 1 else 6
-    first = int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    blade = nominal_blade(None)
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    arguments.add_argument("parts", type=int, nargs="?", default=6)
+    arguments.add_argument("first", type=int, nargs="?", default=0)
+    arguments.add_argument("--real", action="store_true")
+    asked = arguments.parse_args()
+    blades = nominals(asked.real)
+    if not blades:
+        print("skipped: the real parts are not beside the project")
+        return 0
     done = []
     print(f"{'seed':>5} {'truth':7}{'word':7} {'clear %':>7} {'mm3':>8}  why, where it is not the truth")
-    for seed in range(first, first + parts):
+    for seed in range(asked.first, asked.first + asked.parts):
         with tempfile.TemporaryDirectory() as folder:
-            done.append(judged(blade, seed, Path(folder)))
+            done.append(judged(blades[seed % len(blades)], seed, Path(folder)))
         part = done[-1]
         why = "" if part.word == part.truth else "; ".join(part.reasons[:2])
         print(

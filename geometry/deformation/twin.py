@@ -20,7 +20,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh
 
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
-HELD = 0.2  # of the usual number of points makes a place trusted
+HELD = 0.2  # of the usual number of points makes a place count, twice as many make it trusted
 EVERY = 2  # a round fits every other place
 RIPPLE_CELLS = 0.5  # of the lattice, over which ripple is alike
 FACETS = 0.01  # of `damage_mm`: the nominal's facets and normals are no better
@@ -166,12 +166,14 @@ def _sample(
         goal_mm = residual_mm + before.freeform.along(votes.centre_mm, votes.normals)
     share_mm2 = votes.noise_mm**2 / np.maximum(votes.count, 1.0)
     usual = float(np.median(votes.count[votes.count > 0.0]))
-    some = votes.count >= max(1.0, HELD * usual)  # fewer lie on the rim of a break, and shallow on it
+    least = max(1.0, HELD * usual)  # fewer lie on the rim of a break, and shallow on it
+    some = votes.count >= least
     misfit_mm2 = max(spread(residual_mm[some]) ** 2 - float(np.median(share_mm2[some])), NO_NOISE_MM**2)
     aside_mm2 = (0.5 * votes.bend_per_mm * misfit_mm2) ** 2
     weight = biweight(
         residual_mm, TUKEY * np.sqrt(misfit_mm2 + share_mm2 + aside_mm2 + (0.5 * loose_mm) ** 2)
     )
+    weight *= np.clip(votes.count / least - 1.0, 0.0, 1.0)  # not by one point more or less
     held = some & (weight > 1e-3) & (np.arange(len(some)) % every == 0)
     variance_mm2 = (share_mm2 + aside_mm2 + (FACETS * damage_mm) ** 2)[held] / weight[held]
     return sample_of(ground.lattice, votes.centre_mm[held], votes.normals[held], goal_mm[held], variance_mm2)
