@@ -20,7 +20,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh
 
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
-HELD = 0.2  # of the usual number of points makes a place count, twice as many make it trusted
+HELD = 0.2  # of the usual number of points makes a place trusted
 EVERY = 2  # a round fits every other place
 RIPPLE_CELLS = 0.5  # of the lattice, over which ripple is alike
 FACETS = 0.01  # of `damage_mm`: the nominal's facets and normals are no better
@@ -127,7 +127,7 @@ def _fit_rounds(
     wear: Wear | None = None
     for rounds in range(1, settings.rounds + 1):
         loose_mm = settings.damage_mm * max(1, LOOSE_ROUNDS + 1 - rounds)
-        sample = _sample(found, sound, wear, loose_mm, settings.damage_mm, ground, EVERY)
+        sample = _sample(found, sound, wear, loose_mm, settings.damage_mm, ground, settling=True)
         if rounds == LOOSE_ROUNDS:  # the first tells where the blade is, not yet how it is worn
             prior = likeliest_prior(sample, prior, ground.lattice, settings.places // 2)
         wear = fit_wear(sample, prior, ground.lattice)
@@ -151,11 +151,13 @@ def _sample(
     loose_mm: float,
     damage_mm: float,
     ground: Ground,
-    every: int = 1,
+    settling: bool = False,
 ) -> Sample:
     """The displacements that the means of the sound points show; those that stand out count for less.
 
-    `every` so many of the coarse nodes is asked, always the same ones, so that rounds compare.
+    While rounds are `settling` only some of the coarse nodes are asked, always the same ones, so that rounds
+    compare; and those that few points hold count for little, else one point more or less, which the next
+    round takes back, keeps them from settling.
 
     While the free form is off, feet lie aside by about as much, and where the surface bends that reads as
     metal lost: such places count for little until it fits.
@@ -173,8 +175,10 @@ def _sample(
     weight = biweight(
         residual_mm, TUKEY * np.sqrt(misfit_mm2 + share_mm2 + aside_mm2 + (0.5 * loose_mm) ** 2)
     )
-    weight *= np.clip(votes.count / least - 1.0, 0.0, 1.0)  # not by one point more or less
-    held = some & (weight > 1e-3) & (np.arange(len(some)) % every == 0)
+    held = some & (weight > 1e-3)
+    if settling:
+        weight *= np.clip(votes.count / least - 1.0, 0.0, 1.0)
+        held = some & (weight > 1e-3) & (np.arange(len(some)) % EVERY == 0)
     variance_mm2 = (share_mm2 + aside_mm2 + (FACETS * damage_mm) ** 2)[held] / weight[held]
     return sample_of(ground.lattice, votes.centre_mm[held], votes.normals[held], goal_mm[held], variance_mm2)
 
