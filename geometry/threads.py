@@ -1,10 +1,11 @@
 """Linear algebra on the caller's own thread."""
 
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
-from threadpoolctl import threadpool_limits
+import scipy.linalg  # noqa: F401  brings a BLAS of its own
+from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -19,7 +20,13 @@ def one_blas_thread(verb: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(verb)
     def kept(*args: P.args, **kwargs: P.kwargs) -> T:
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _libraries().limit(limits=1, user_api="blas"):
             return verb(*args, **kwargs)
 
     return kept
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """Those loaded by the first call, numpy's and scipy's among them: to look for them takes milliseconds."""
+    return ThreadpoolController()
