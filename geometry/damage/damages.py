@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
 from geometry.damage.bends import BendSettings, bend_depth, bent_pairs
-from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, span_depth
+from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, reaches_edge, span_depth
 from geometry.damage.detection import edge_limit_mm, tip_limit_mm
 from geometry.damage.normal_depth import normal_depth
 from geometry.damage.regions import (
@@ -33,6 +33,8 @@ NOT_SOUGHT = NotMeasured(reason="was not looked for")
 ALONE = NotMeasured(reason="no other damage")
 HOLLOW_SPACINGS = 12.0  # width of the hollow, in point spacings, that the detection limit is stated for
 KEPT = 0.8  # of the depth of such a hollow is left in the mean over a neighbourhood
+EDGES = (Zone.LEADING_EDGE, Zone.TRAILING_EDGE)
+PROVEN = 2.0  # sigmas of the loss of an edge
 PRECEDENCE = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
 
 
@@ -148,11 +150,16 @@ def _described(
 def _loss(
     region: Region, found: Field, nominal: Nominal, twin: Twin, zone: Zone, lowest: Measured
 ) -> EdgeLoss:
-    """The depth of a damage by the rule of its zone, and the chord left where that is an edge."""
-    if region.missing and zone in (Zone.LEADING_EDGE, Zone.TRAILING_EDGE):
-        return edge_loss(region, found, nominal, twin, zone)
+    """The depth of a damage by the rule of its zone, and the chord left where that is an edge.
+
+    Beside an edge that is whole a pit is as deep as on a side: nothing of the edge went back.
+    """
     if region.missing and zone is Zone.TIP:
         return EdgeLoss(depth_mm=_tip_depth(lowest, found, nominal), remaining_chord_mm=NOT_AN_EDGE)
+    if region.missing and zone in EDGES and reaches_edge(region, found, nominal, zone):
+        loss = edge_loss(region, found, nominal, twin, zone)
+        if isinstance(loss.depth_mm, NotMeasured) or loss.depth_mm.value > PROVEN * loss.depth_mm.sigma:
+            return loss
     return EdgeLoss(depth_mm=normal_depth(region, found, nominal, twin), remaining_chord_mm=NOT_AN_EDGE)
 
 

@@ -21,6 +21,7 @@ LEAST_FRONT = 10
 FRONT = 0.1  # standard uncertainty of that quadric between the points, in their spacings, at least
 HEIGHTS = 40  # over an edge damage, at most
 RIM_STEP_MM = 0.02  # between points of the twin's section at an edge
+ON_EDGE = 1.5  # spacings of the points from the line of an edge that count as on it
 NEAR_EDGE_MM = 6.0  # of the edge line, where the edge of the twin is sought
 
 
@@ -116,6 +117,14 @@ def _plane_section(twin: Twin, at_mm: Floats, normal: Floats, about_mm: Floats, 
     cut = above_a * above_b < 0.0
     share = above_a[cut] / (above_a[cut] - above_b[cut])
     return np.asarray(vertices[a[cut]] + share[:, None] * (vertices[b[cut]] - vertices[a[cut]]))
+
+
+def reaches_edge(region: Region, found: Field, nominal: Nominal, zone: Zone) -> bool:
+    """Whether skin on the line of an edge was lost: beside it a break tells nothing of the edge."""
+    skin_mm = nominal.samples.points_mm[region.lost] if len(region.lost) else found.scan_mm[region.points]
+    line = nominal.le_line_mm if zone is Zone.LEADING_EDGE else nominal.te_line_mm
+    apart_mm = np.linalg.norm(skin_mm[:, :2] - on_line_mm(line, skin_mm[:, 2]), axis=1)
+    return bool(apart_mm.min() <= max(ON_EDGE * found.spacing_mm, nominal.settings.sample_mm))
 
 
 def edge_loss(region: Region, found: Field, nominal: Nominal, twin: Twin, zone: Zone) -> EdgeLoss:

@@ -9,6 +9,7 @@ from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin
 from geometry.types import Floats, Ints, Measurand, Mesh
 
+BORDERING = 1.5  # spacings from lost skin within which its break begins
 A_SIDE = 0.1  # of the lost skin that makes it a side of its own: metal that is gone from both is pierced
 
 
@@ -45,8 +46,10 @@ def _heights(region: Region, found: Field, nominal: Nominal, twin: Twin) -> Floa
     points_mm = found.scan_mm[region.points]
     for side in _sides(region.lost, nominal):
         skin = _skin_over(side, found, twin)
-        if skin is not None:
-            _, feet_mm, face = skin.closest(points_mm)
+        if skin is None:
+            continue
+        apart_mm, feet_mm, face = skin.closest(points_mm)
+        if np.abs(apart_mm).min() <= BORDERING * found.spacing_mm:  # else it was not seen
             inward_mm = ((points_mm - feet_mm) * skin.normals[face]).sum(axis=1)
             height_mm[region.points] = np.minimum(height_mm[region.points], inward_mm)
     return height_mm

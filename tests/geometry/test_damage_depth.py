@@ -9,7 +9,7 @@ import pytest
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.damage.damages import Damage, find_damages
-from geometry.types import Measurand, Measured, Zone
+from geometry.types import Measurand, Measured, NotMeasured, Zone
 from tests.geometry import repair_blades as blades
 
 NOISE_MM = 0.012
@@ -104,6 +104,27 @@ def test_a_hole_is_as_deep_as_the_metal_is_thick(per_mm2: float) -> None:
     _, normal = blades.pressure_side_at(0.45, 0.55 * blades.SPAN_MM)
     thick_mm = float(np.ptp(blades.mesh_of(lost("hole")).vertices_mm @ normal))
     assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thick_mm, rel=0.06)
+
+
+@pytest.mark.parametrize(("share", "depth_mm"), [(0.8, 0.6), (0.85, 0.5), (0.9, 0.4)])
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_pit_beside_an_edge_that_is_whole_is_as_deep_as_on_a_side(
+    share: float, depth_mm: float, seen: bool
+) -> None:
+    """Whether or not the other side of the thin metal under it was seen."""
+    cutters = {Zone.SURFACE: blades.pit_cutter(depth_mm, 2.0, share)}
+    scanned = blades.specimen(cutters, NOISE_MM, np.random.default_rng(0), 25.0)
+    at_mm, normal = blades.pressure_side_at(share, 0.55 * blades.SPAN_MM)
+    off_mm = scanned.cloud.points_mm - at_mm
+    behind = (off_mm @ normal < -0.9) & (np.linalg.norm(np.cross(off_mm, normal), axis=1) < 3.0)
+    scanned = blades.without(scanned, behind & (scanned.on_break < 0) & (not seen))
+    mask = scanned.on_break >= 0
+    (damage,) = find_damages(scanned.cloud, mask, scanned.alignment, nominal(), scanned.twin)
+    depth = number(damage.depth_mm)
+    assert damage.zone is Zone.TRAILING_EDGE
+    assert isinstance(damage.remaining_chord_mm, NotMeasured)
+    assert depth.value == pytest.approx(depth_mm, abs=3.0 * depth.sigma)
+    assert depth.sigma < 0.05
 
 
 def test_a_rough_break_is_as_deep_as_it_is_told_within_its_uncertainty() -> None:
