@@ -89,10 +89,7 @@ def edge_nick(
 
     Its flank toward the tip is the gentle one, so that a scanner that looks down sees all of it.
     """
-    z_mm = airfoil.height_mm(span_fraction)
-    le, te = airfoil.edge_points_mm(z_mm)
-    edge, far = (le, te) if zone == "leading_edge" else (te, le)
-    outward = _unit(edge - far)
+    edge, outward = _edge(airfoil, zone, airfoil.height_mm(span_fraction))
     across = np.array([-outward[1], outward[0], 0.0])
     rough = _roughness(rng, 0.04 * depth_mm, width_mm)
     below, above = 0.3 * width_mm, 0.7 * width_mm
@@ -128,9 +125,7 @@ def eroded_edge(
     It runs out at both ends, and on both sides into the skin.
     """
     z_mm = np.linspace(airfoil.height_mm(span_fractions[0]), airfoil.height_mm(span_fractions[1]), 241)
-    ends = np.array([airfoil.edge_points_mm(z) for z in z_mm])
-    edge, far = (ends[:, 0], ends[:, 1]) if zone == "leading_edge" else (ends[:, 1], ends[:, 0])
-    outward = (edge - far) / np.linalg.norm(edge - far, axis=1)[:, None]
+    edge, outward = (np.array(rows) for rows in zip(*(_edge(airfoil, zone, z) for z in z_mm), strict=True))
     across = np.column_stack([outward[:, 1], -outward[:, 0], np.zeros(len(z_mm))])
     v_mm = np.linspace(-1.0, 1.0, 121) * 0.1 * airfoil.chord_mm
     t, v = np.meshgrid(np.linspace(-1.0, 1.0, len(z_mm)), v_mm, indexing="ij")
@@ -201,6 +196,13 @@ def _pressure_frame(
     inward = np.append(frame.toward_suction, 0.0)
     along = _unit(chordwise)
     return centre, along, np.cross(normal, along), -normal * np.sign(normal @ inward)
+
+
+def _edge(airfoil: Airfoil, zone: EdgeName, z_mm: float) -> tuple[Floats, Floats]:
+    """The point (3,) of an edge at a height, and the unit vector (3,) along the chord out of it."""
+    le, te = airfoil.edge_points_mm(z_mm)
+    edge, far = (le, te) if zone == "leading_edge" else (te, le)
+    return edge, _unit(edge - far)
 
 
 def _unit(vector: Floats) -> Floats:

@@ -218,10 +218,7 @@ class Nominal:
         z_mm = points_mm[:, 2]
         top_mm = self.z_max_mm if self.z_max_mm < self.tip_z_mm else np.inf
         off = ~self.airfoil_face[face] | (z_mm < self.z_min_mm) | (z_mm > top_mm)
-        le_mm, te_mm = (
-            np.linalg.norm(points_mm[:, :2] - on_line_mm(line, z_mm), axis=1)
-            for line in (self.le_line_mm, self.te_line_mm)
-        )
+        le_mm, te_mm = self.from_edges_mm(points_mm)
         in_tip = z_mm >= self.tip_z_mm - self.settings.tip_mm
         in_le = (le_mm <= self.settings.edge_mm) & (le_mm <= te_mm)
         in_te = te_mm <= self.settings.edge_mm
@@ -229,6 +226,14 @@ class Nominal:
         return np.select(
             [off, in_tip, in_le, in_te], [ZONE_ORDER.index(z) for z in zones], ZONE_ORDER.index(Zone.SURFACE)
         )
+
+    def from_edges_mm(self, points_mm: Floats) -> tuple[Floats, Floats]:
+        """How far (n,) points (n, 3) lie from leading and trailing edge line, in the section plane."""
+        le_mm, te_mm = (
+            np.linalg.norm(points_mm[:, :2] - on_line_mm(line, points_mm[:, 2]), axis=1)
+            for line in (self.le_line_mm, self.te_line_mm)
+        )
+        return le_mm, te_mm
 
     def _nearest_faces(self, points_mm: Floats) -> Ints:
         """The nearest face (n,) to float32, computed about the centre of the mesh to lose least."""

@@ -154,6 +154,8 @@ def _shape(skin: Skin, break_mm: Floats, sound_mm: Floats, reach_mm: float) -> t
     normals = skin.normals[skin.closest(beside_mm)[2]]
     of_break = alone[1][cKDTree(break_mm).query(beside_mm)[1], 2]
     smooth = np.abs((normals * of_break).sum(axis=1)) > SMOOTH
+    if not smooth.any():
+        return alone
     return local_quadrics(break_mm, np.concatenate([break_mm, beside_mm[smooth]]))
 
 

@@ -35,7 +35,7 @@ HOLLOW_SPACINGS = 12.0  # width of the hollow, in point spacings, that the detec
 KEPT = 0.8  # of the depth of such a hollow is left in the mean over a neighbourhood
 EDGES = (Zone.LEADING_EDGE, Zone.TRAILING_EDGE)
 PROVEN = 2.0  # sigmas of the loss of an edge
-PRECEDENCE = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
+PRECEDENCE = (Zone.TIP, *EDGES, Zone.SURFACE)
 
 
 class DamageKind(StrEnum):

@@ -122,8 +122,8 @@ def _plane_section(twin: Twin, at_mm: Floats, normal: Floats, about_mm: Floats, 
 def reaches_edge(region: Region, found: Field, nominal: Nominal, zone: Zone) -> bool:
     """Whether skin on the line of an edge was lost: beside it a break tells nothing of the edge."""
     skin_mm = nominal.samples.points_mm[region.lost] if len(region.lost) else found.scan_mm[region.points]
-    line = nominal.le_line_mm if zone is Zone.LEADING_EDGE else nominal.te_line_mm
-    apart_mm = np.linalg.norm(skin_mm[:, :2] - on_line_mm(line, skin_mm[:, 2]), axis=1)
+    le_mm, te_mm = nominal.from_edges_mm(skin_mm)
+    apart_mm = le_mm if zone is Zone.LEADING_EDGE else te_mm
     return bool(apart_mm.min() <= max(ON_EDGE * found.spacing_mm, nominal.settings.sample_mm))
 
 

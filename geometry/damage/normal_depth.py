@@ -44,13 +44,15 @@ def _heights(region: Region, found: Field, nominal: Nominal, twin: Twin) -> Floa
         return found.height_mm
     height_mm = found.height_mm.copy()
     points_mm = found.scan_mm[region.points]
+    face, sample = _faces_over(region.lost, found, twin)
     for side in _sides(region.lost, nominal):
-        skin = _skin_over(side, found, twin)
-        if skin is None:
+        own = face[np.isin(sample, side)]
+        if not len(own):
             continue
-        apart_mm, feet_mm, face = skin.closest(points_mm)
+        skin = Skin(Mesh(vertices_mm=twin.mesh.vertices_mm, faces=twin.mesh.faces[own]))
+        apart_mm, feet_mm, foot = skin.closest(points_mm)
         if np.abs(apart_mm).min() <= BORDERING * found.spacing_mm:  # else it was not seen
-            inward_mm = ((points_mm - feet_mm) * skin.normals[face]).sum(axis=1)
+            inward_mm = ((points_mm - feet_mm) * skin.normals[foot]).sum(axis=1)
             height_mm[region.points] = np.minimum(height_mm[region.points], inward_mm)
     return height_mm
 
@@ -63,13 +65,12 @@ def _sides(lost: Ints, nominal: Nominal) -> list[Ints]:
     return [lost[side] for side in (above, ~above) if area_mm2[side].sum() > A_SIDE * area_mm2.sum()]
 
 
-def _skin_over(side: Ints, found: Field, twin: Twin) -> Skin | None:
-    """The faces of the twin round the samples `side`."""
-    low_mm, high_mm = found.skin_mm[side].min(axis=0), found.skin_mm[side].max(axis=0)
+def _faces_over(lost: Ints, found: Field, twin: Twin) -> tuple[Ints, Ints]:
+    """The faces of the twin about the lost samples, and the sample that is nearest to each."""
+    low_mm, high_mm = found.skin_mm[lost].min(axis=0), found.skin_mm[lost].max(axis=0)
     middle_mm = twin.mesh.vertices_mm[twin.mesh.faces].mean(axis=1)
     boxed = np.flatnonzero(((middle_mm >= low_mm - 1.0) & (middle_mm <= high_mm + 1.0)).all(axis=1))
-    own = boxed[np.isin(cKDTree(found.skin_mm).query(middle_mm[boxed])[1], side)]
-    return Skin(Mesh(vertices_mm=twin.mesh.vertices_mm, faces=twin.mesh.faces[own])) if len(own) else None
+    return boxed, np.asarray(cKDTree(found.skin_mm).query(middle_mm[boxed])[1])
 
 
 def _bottom(u_mm: Floats, v_mm: Floats, depth_mm: Floats, spacing_mm: float) -> tuple[Floats, float]:

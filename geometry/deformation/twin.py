@@ -175,10 +175,11 @@ def _sample(
     weight = biweight(
         residual_mm, TUKEY * np.sqrt(misfit_mm2 + share_mm2 + aside_mm2 + (0.5 * loose_mm) ** 2)
     )
-    held = some & (weight > 1e-3)
+    asked = some
     if settling:
         weight *= np.clip(votes.count / least - 1.0, 0.0, 1.0)
-        held = some & (weight > 1e-3) & (np.arange(len(some)) % EVERY == 0)
+        asked = some & (np.arange(len(some)) % EVERY == 0)
+    held = asked & (weight > 1e-3)
     variance_mm2 = (share_mm2 + aside_mm2 + (FACETS * damage_mm) ** 2)[held] / weight[held]
     return sample_of(ground.lattice, votes.centre_mm[held], votes.normals[held], goal_mm[held], variance_mm2)
 

@@ -72,6 +72,13 @@ def edge_truth() -> tuple[float, float]:
     return float(losses.max()), float(chords.min())
 
 
+@cache
+def thickness_mm() -> float:
+    """Of the metal under the pits and about the hole."""
+    _, normal = blades.pressure_side_at(0.45, 0.55 * blades.SPAN_MM)
+    return float(np.ptp(blades.mesh_of(lost("hole")).vertices_mm @ normal))
+
+
 def truth(name: str) -> float:
     if name == "tip corner":
         return blades.SPAN_MM - float(blades.mesh_of(lost(name)).vertices_mm[:, 2].min())
@@ -92,18 +99,14 @@ def test_the_depth_is_unbiased_from_dense_to_thin_scans(name: str) -> None:
 
 @pytest.mark.parametrize("per_mm2", [60.0, 25.0])
 def test_a_pit_is_as_deep_as_it_was_cut_where_the_other_side_is_nearer(per_mm2: float) -> None:
-    _, normal = blades.pressure_side_at(0.45, 0.55 * blades.SPAN_MM)
-    thick_mm = float(np.ptp(blades.mesh_of(lost("hole")).vertices_mm @ normal))
-    assert 0.6 * thick_mm < DEEP_MM
+    assert 0.6 * thickness_mm() < DEEP_MM
     depth = number(one("deep pit", per_mm2, 0).depth_mm)
     assert depth.value == pytest.approx(DEEP_MM, abs=3.0 * depth.sigma + 0.02)
 
 
 @pytest.mark.parametrize("per_mm2", [60.0, 25.0])
 def test_a_hole_is_as_deep_as_the_metal_is_thick(per_mm2: float) -> None:
-    _, normal = blades.pressure_side_at(0.45, 0.55 * blades.SPAN_MM)
-    thick_mm = float(np.ptp(blades.mesh_of(lost("hole")).vertices_mm @ normal))
-    assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thick_mm, rel=0.06)
+    assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thickness_mm(), rel=0.06)
 
 
 @pytest.mark.parametrize(("share", "depth_mm"), [(0.8, 0.6), (0.85, 0.5), (0.9, 0.4)])
