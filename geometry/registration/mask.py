@@ -21,22 +21,26 @@ IRLS_STEPS = 4
 RIDGE = 1e-3  # flat surfaces do not tell all motions
 REACHES = 6
 LIDS = 10  # part of the points for the form, at least, that may lie on end faces
+LOOKED_AT = 4  # times as many points as are taken for the form
+TRIES = 4  # for the size of a cell that takes one
+HASH = np.array([73856093, 19349663, 83492791, 49979687, 86028121, 67867979])  # of a cell's six coordinates
 MEDIAN = 1.25  # a median scatters so much more than a mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaskSettings:
     neighbours: int = 16
-    high: float = 7.0  # of the scale: certainly damaged; among a million points noise does not reach it
-    low: float = 2.5  # damaged if joined to what certainly is
+    high: float = 4.5  # of the scale: certainly damaged; of a million points noise takes a few so far
+    low: float = 2.2  # damaged if joined to what certainly is
     own: float = 3.0  # of the scatter of single points: sound if its neighbours are
     ring: int = 5  # nearest neighbours of damage that are damage too
     shallow_mm: float = 0.02  # of a neighbourhood: a rim that is further off stays damage
     exact_mm: float = 0.004  # of a neighbourhood: no better is a form known
     form_mm: float = 0.15  # smooth deviations up to this are form, not damage
-    rim_mm: float = 2.0  # around points that are further off, where a damage may run out
-    form_points: int = 15_000  # of the cloud, to find them
-    form_nodes: int = 1000  # local fits
+    rim_mm: float = 2.0  # around points that are further off, where a damage may run out ...
+    usual: float = 1.0  # ... unless a point there is no further off than this share of the scatter
+    form_points: int = 20_000  # of the cloud, to find them
+    form_nodes: int = 1500  # local fits
     form_window: int = 160  # points in each
 
     def __post_init__(self) -> None:
@@ -44,7 +48,7 @@ class MaskSettings:
             raise BadInput(f"mask: {self} contradicts itself")
         if not (min(self.own, self.shallow_mm) > 0.0 and self.exact_mm >= 0.0 and self.ring >= 0):
             raise BadInput(f"mask: {self} has no rim")
-        if not (self.form_mm > 0.0 and self.rim_mm >= 0.0):
+        if not (self.form_mm > 0.0 and self.rim_mm >= 0.0 and self.usual >= 0.0):
             raise BadInput(f"mask: form {self.form_mm} mm and rim {self.rim_mm} mm are no distances")
         if not 20 <= self.form_window <= self.form_nodes <= self.form_points:
             raise BadInput(f"mask: {self} has too few points for a form")
@@ -76,15 +80,18 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
 
     Local fits over a few millimetres, robust against what is abrupt, blended between their nodes. Points
     further than `form_mm` off, or four robust sigmas of all, take no part, nor do those next to them: within
-    a wide damage the form is that of its surroundings. Where a bent blade leaves the nominal smoothly by
-    more, the fits reach out until no more points join.
+    a wide damage the form is that of its surroundings. But a break is sharp, and the form runs up to it: what
+    lies there as near the nominal as most points do tells it. Where a bent blade leaves the nominal smoothly
+    by more, the fits reach out until no more points join.
     """
     place = np.column_stack([points_mm, TURN_MM * normals])
-    few = _sampled(normals, settings)
-    limit_mm = max(settings.form_mm, 4.0 * robust_sigma(distance_mm))
-    near = np.abs(distance_mm[few]) <= limit_mm
+    few = _sampled(place, normals, settings)
+    off_mm, scatter_mm = np.abs(distance_mm[few]), robust_sigma(distance_mm)
+    limit_mm = max(settings.form_mm, 4.0 * scatter_mm)
+    near = off_mm <= limit_mm
     for _ in range(REACHES):
-        chosen = few[_clear(place[few], near, settings.rim_mm)]
+        beside = _next_to(place[few], ~near, settings.rim_mm) & (off_mm > settings.usual * scatter_mm)
+        chosen = few[near & ~beside]
         if len(chosen) < settings.form_window:  # nothing of the nominal's form is left to tell
             return np.zeros(len(points_mm))
         nodes = chosen[_every_nth(len(chosen), settings.form_nodes)]
@@ -99,19 +106,38 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
     return _blend(points_mm, normals, points_mm[nodes], normals[nodes], fits)
 
 
-def _sampled(normals: Floats, settings: MaskSettings) -> Ints:
+def _sampled(place: Floats, normals: Floats, settings: MaskSettings) -> Ints:
     """Indices of points evenly through all, and of more of them on end faces: these are small, and hold z."""
-    some = _every_nth(len(normals), settings.form_points)
+    looked_at = _every_nth(len(place), LOOKED_AT * settings.form_points)
     lid = np.flatnonzero(np.abs(normals[:, 2]) > UP)
-    return np.union1d(some, lid[_every_nth(len(lid), settings.form_points // LIDS)])
+    return np.union1d(
+        looked_at[_one_to_a_cell(place[looked_at], settings.form_points)],
+        lid[_every_nth(len(lid), settings.form_points // LIDS)],
+    )
 
 
-def _clear(place: Floats, near: Bools, rim_mm: float) -> Bools:
-    """Of the points (n, 6) near the form, those that no point off it is next to."""
-    if near.all():
-        return near
-    apart, _ = cKDTree(place[~near]).query(place, distance_upper_bound=np.nextafter(rim_mm, np.inf))
-    return near & ~np.isfinite(apart)
+def _one_to_a_cell(place: Floats, most: int) -> Ints:
+    """Indices of about `most` points (n, 6), or of all, even over the surface and over the way it looks.
+
+    A thin edge has little surface but turns far: so it gets its share, and what form it has is not taken
+    for damage.
+    """
+    if len(place) <= most:
+        return np.arange(len(place))
+    cell_mm = float(np.ptp(place, axis=0).max()) / np.sqrt(most)
+    for _ in range(TRIES):
+        cells = np.floor(place / cell_mm).astype(np.int64) @ HASH  # two that collide cost one point
+        first = np.unique(cells, return_index=True)[1]
+        cell_mm *= np.sqrt(len(first) / most)
+    return np.sort(first)
+
+
+def _next_to(place: Floats, off: Bools, rim_mm: float) -> Bools:
+    """Of the points (n, 6) those within `rim_mm` of one that is off."""
+    if not off.any():
+        return off
+    apart_mm, _ = cKDTree(place[off]).query(place, distance_upper_bound=np.nextafter(rim_mm, np.inf))
+    return np.isfinite(apart_mm)
 
 
 def _every_nth(count: int, most: int) -> Ints:
