@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geometry.blade import outline as outlines
 from geometry.blade.outline import End, Outline
@@ -22,6 +21,7 @@ from geometry.blade.solid import (
 )
 from geometry.blade.span import airfoil_start_mm, edge_lines, on_line_mm
 from geometry.errors import BadInput
+from geometry.kernels.neighbours import near_each_other
 from geometry.kernels.parts import over_parts, threads_for
 from geometry.kernels.triangle import describe_feet, refine_closest
 from geometry.types import Bools, Floats, Ints, Mesh, Zone
@@ -32,7 +32,6 @@ CURVE_POINTS = 2000  # and has at least so many points
 SPAN_SLACK = (
     1e-3  # of the height: a plan's span may pass the mesh by this much, for files round their numbers
 )
-CACHE_CELL_MM = 2.0  # neighbouring queries are asked together
 UP = 0.7  # the z of a unit normal that looks up rather than sideways
 
 
@@ -238,7 +237,7 @@ class Nominal:
     def _nearest_faces(self, points_mm: Floats) -> Ints:
         """The nearest face (n,) to float32, computed about the centre of the mesh to lose least."""
         query = np.ascontiguousarray(points_mm - self._centre_mm, dtype=np.float32)
-        order = _near_each_other(query)
+        order = near_each_other(points_mm)
         found = self._scene.compute_closest_points(query[order], nthreads=threads_for(len(query)))
         face = np.empty(len(query), np.int64)
         face[order] = found["primitive_ids"].numpy()
@@ -321,14 +320,6 @@ def _ray_scene(vertices_mm: Floats, faces: Ints) -> Any:
     tensor = open3d.core.Tensor.from_numpy
     scene.add_triangles(tensor(vertices_mm.astype(np.float32)), tensor(faces.astype(np.uint32)))
     return scene
-
-
-def _near_each_other(points: NDArray[np.float32]) -> Ints:
-    """An order (n,) that visits points cell by cell: the tree that is searched stays in the cache."""
-    if len(points) == 0:
-        return np.zeros(0, np.int64)
-    cells = ((points - points.min(axis=0)) / CACHE_CELL_MM).astype(np.int64)
-    return np.argsort(cells @ np.array([1 << 40, 1 << 20, 1]), kind="stable")
 
 
 def _sample(nominal: Nominal) -> SurfaceSamples:

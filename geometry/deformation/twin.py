@@ -12,9 +12,9 @@ from geometry.deformation.moved_mesh import at_nodes, at_vertices, form_deviatio
 from geometry.deformation.offset import Offset, fit_offset
 from geometry.deformation.votes import NO_NOISE_MM, Found, binned, compare, gather, ripple_mm, screen
 from geometry.errors import CannotFitTwin
+from geometry.kernels.neighbours import near_each_other
 from geometry.registration.alignment import Alignment
 from geometry.robust import TUKEY, biweight, spread
-from geometry.scan.surface import near_each_other
 from geometry.threads import one_blas_thread
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh

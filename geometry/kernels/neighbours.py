@@ -13,6 +13,8 @@ SAMPLE = 20_000  # points that tell how dense a cloud is
 CROWDED = 16  # of them in a cell: too coarse a look
 WIDER = 1.3  # than the k nearest reach in the mean
 LARGEST = np.iinfo(np.int64).max
+NEAR_MM = 2.0  # cells of points that are asked together
+TURNS = 64  # of such cells, on each axis, until they take turns with the first again
 
 
 def k_nearest(points_mm: Floats, k: int) -> tuple[Ints, Floats]:
@@ -294,3 +296,16 @@ def counting_sort(keys: Ints, bins: int) -> tuple[Ints, Ints]:
         order[cursor[keys[i]]] = i
         cursor[keys[i]] += 1
     return starts, order
+
+
+@njit(cache=True, nogil=True)
+def near_each_other(points_mm: Floats) -> Ints:
+    """An order (n,) in which the points of one cell follow each other: a tree that is asked so answers twice
+    as fast. Cells 64 apart take turns, so that a stray point costs nothing."""
+    keys = np.empty(len(points_mm), np.int64)
+    for i in range(len(points_mm)):
+        key = 0
+        for axis in range(3):
+            key = key * TURNS + int(np.floor(points_mm[i, axis] / NEAR_MM)) % TURNS
+        keys[i] = key
+    return counting_sort(keys, TURNS**3)[1]

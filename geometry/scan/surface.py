@@ -2,13 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from geometry.errors import BadInput
 from geometry.kernels import neighbours, quadric
 from geometry.types import Floats, Ints
-
-CELL_MM = 2.0  # of the grid that brings near points together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,10 +51,3 @@ def local_shape(
         mean_per_mm=mean,
         offset_mm=offset,
     )
-
-
-def near_each_other(points_mm: Floats) -> Ints:
-    """An order (n,) in which the points of one cell of a grid follow each other: a tree that is asked so
-    answers twice as fast."""
-    cell = np.floor(points_mm / CELL_MM).astype(np.int64)
-    return np.asarray(np.lexsort(cell.T))

@@ -14,11 +14,12 @@ from scipy.spatial import cKDTree
 from geometry.blade.nominal import Nominal
 from geometry.errors import BadInput, CannotRegister
 from geometry.kernels.hausdorff import average_hausdorff
+from geometry.kernels.neighbours import near_each_other
 from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import principal_frame
 from geometry.registration.fit import every, felt, information, solve_step
 from geometry.robust import robust_sigma
-from geometry.scan.surface import local_shape, near_each_other
+from geometry.scan.surface import local_shape
 from geometry.thesis.cad_points import pitch_of, sample_cad
 from geometry.transforms import apply, inverse, rigid
 from geometry.types import Bools, Cloud, Floats, Ints

@@ -6,7 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from geometry.kernels.neighbours import choose, counting_sort, k_nearest, room_for, sorted_nearest
+from geometry.kernels.neighbours import (
+    NEAR_MM,
+    TURNS,
+    choose,
+    counting_sort,
+    k_nearest,
+    near_each_other,
+    room_for,
+    sorted_nearest,
+)
 
 
 def slow_distances(points, k):
@@ -75,6 +84,22 @@ def test_counting_sort_is_stable():
     starts, order = counting_sort(keys, 4)
     assert starts.tolist() == [0, 2, 3, 5, 5]
     assert order.tolist() == np.argsort(keys, kind="stable").tolist()
+
+
+def test_points_of_one_cell_follow_each_other():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-30.0, 30.0, (5000, 3))
+    order = near_each_other(points)
+    assert sorted(order.tolist()) == list(range(5000))
+    cells = np.floor(points[order] / NEAR_MM).astype(int)
+    runs = 1 + np.count_nonzero(np.any(np.diff(cells, axis=0) != 0, axis=1))
+    assert runs == len(np.unique(cells, axis=0))
+
+
+def test_a_stray_point_far_away_costs_no_memory_and_takes_its_turn():
+    points = np.array([[0.0, 0.0, 0.0], [1e9, -1e9, 0.5], [TURNS * NEAR_MM, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    assert sorted(near_each_other(points).tolist()) == [0, 1, 2, 3]
+    assert near_each_other(np.zeros((0, 3))).tolist() == []
 
 
 @settings(max_examples=25, deadline=None)
