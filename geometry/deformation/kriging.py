@@ -24,8 +24,7 @@ TYPICAL_MM = (0.05, 0.05, 0.003)  # shift, swelling, ripple
 SECTION_SHARE = 0.45  # of the section's extent: over so much wear is alike
 RIPPLE_CELLS = 0.65  # over so much ripple is alike
 SHORTEST_CELLS, LONGEST_EXTENTS = 1.75, 4.0  # bounds of the lengths of wear
-STEPS = 12  # of the search for the prior, at most ...
-ENOUGH = 1e-5  # ... or until a step gains less than this share of the log likelihood, some hundredths
+STEPS = 12  # of the search for the prior, at most
 SLOPE_STEP = 1e-3  # of the logarithms, between the slopes whose difference is the curvature
 LOOSEST = 1.0  # of the logarithms: a rival prior is no farther off
 
@@ -122,7 +121,7 @@ def likeliest_prior(sample: Sample, start: Prior, lattice: Lattice, most: int) -
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
-        options={"maxiter": STEPS, "ftol": ENOUGH},
+        options={"maxiter": STEPS},
     )
     return Prior.of(np.exp(found.x))
 
