@@ -29,6 +29,7 @@ class Ground:
     bulge_mm: Floats  # (nodes,) how far a smooth surface stands over the nominal's facets there
     graph: Ints  # (nodes, k) neighbours
     coarse: Nodes  # what the wear is fitted to
+    coarse_of: Ints  # (nodes,) the nearest of these
     from_coarse: sp.csr_array  # (nodes, coarse) carries what is known there
     side_vertex: Ints  # (sides,) of the refined mesh: every vertex, then the other sides of its edges
     side_normals: Floats  # (sides, 3)
@@ -58,6 +59,7 @@ def prepare_ground(nominal: Nominal, nodes: int, cells: int) -> Ground:
         bulge_mm=nominal.bulge_mm[nominal.closest(fine.points_mm).face],
         graph=fine.graph(),
         coarse=coarse,
+        coarse_of=coarse.owner(fine.points_mm, fine.normals),
         from_coarse=coarse.interpolation(fine.points_mm, fine.normals),
         side_vertex=vertex,
         side_normals=normals,

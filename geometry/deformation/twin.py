@@ -162,7 +162,7 @@ def _sample(
     While the free form is off, feet lie aside by about as much, and where the surface bends that reads as
     metal lost: such places count for little until it fits.
     """
-    votes = gather(found, sound, ground.coarse.owner(found.near.points_mm, found.near.normals), ground.coarse)
+    votes = gather(found, sound, ground.coarse_of[found.owner], ground.coarse)  # what is sound has an owner
     residual_mm, goal_mm = votes.along_mm, votes.along_mm
     if before is not None:
         goal_mm = residual_mm + before.freeform.along(votes.centre_mm, votes.normals)
