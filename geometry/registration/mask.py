@@ -41,7 +41,7 @@ class MaskSettings:
     usual: float = 1.0  # ... unless a point there is no further off than this share of the scatter
     form_points: int = 20_000  # of the cloud, to find them
     form_nodes: int = 1500  # local fits
-    form_window: int = 160  # points in each
+    form_window: int = 213  # points in each
 
     def __post_init__(self) -> None:
         if not (self.neighbours >= 4 and 0.0 < self.low <= self.high):

@@ -68,7 +68,7 @@ def test_form_is_the_smooth_part_on_each_side_and_leaves_the_damage():
     pit = np.where((np.hypot(x, y) < 3.0) & (z > 0), 0.4, 0.0)
     form = form_of(points, normals, bent - pit + rng.normal(scale=0.01, size=len(points)), MaskSettings())
     assert np.sqrt(np.mean((form - bent) ** 2)) < 0.004
-    assert np.abs(form - bent)[pit > 0.0].max() < 0.032
+    assert np.abs(form - bent)[pit > 0.0].max() < 0.03
 
 
 def blunt_plate(rng):
