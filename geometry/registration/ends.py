@@ -15,7 +15,7 @@ from geometry.types import Bools, Floats, Ints
 RIM_STEP_MM = 0.05
 RIM_MM = 0.1  # from a rim: there a foot may be on either face, whichever noise pushed its point to
 WINDOW_MM = 1.0  # of the wall's points on both sides of an end
-CLEAR_MM = 2.0  # from damage
+CLEAR_MM = 1.0  # from damage
 LEAST = 100  # points in the window
 LIT = 5  # points on a face beyond a rim that make it seen
 SHARE = 0.05  # of the points that a tip face would have, below which it is not seen

@@ -29,12 +29,15 @@ class RegisterSettings:
     robust_points: int = 8000  # of the cloud, for the robust fit
     fit_points: int = 250_000  # of the cloud, for mask and least squares: 0.0005 mm of noise at most
     rounds: int = 2  # of mask and least squares
+    fit_ring: int = 0  # the mask's ring for these: each sound point left out lets form into the pose
     explained_mm: float = 0.3
     loose_mm: float = 0.3  # standard uncertainty of the surface along a motion that makes it a free one
     slide_mm: float = 0.05  # the same, beyond which other places along that motion are tried
 
     def __post_init__(self) -> None:
-        if not (self.least_points >= 50 and self.robust_points >= 500 and self.rounds >= 1):
+        if not (
+            self.least_points >= 50 and self.robust_points >= 500 and min(self.rounds, self.fit_ring + 1) >= 1
+        ):
             raise BadInput(f"register: {self} asks for too few points or rounds")
         if not min(self.explained_mm, self.loose_mm, self.slide_mm) > 0.0:
             raise BadInput(f"register: {self} has a distance that is none")
@@ -75,9 +78,9 @@ def _settled(
 ) -> Settled:
     """Rounds of mask and least squares on the whole cloud."""
     found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
-    fit = replace(start, found=found)
+    fit, mask = replace(start, found=found), replace(settings.mask, ring=settings.fit_ring)
     for _ in range(settings.rounds):
-        sound = ~_damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, nominal, settings)
+        sound = ~_damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, mask)
         held = int((sound & felt(nominal, fit.found)).sum())
         if held < settings.least_points:
             raise CannotRegister(f"{held} scan points lie on the nominal")
@@ -112,12 +115,10 @@ def _elsewhere(
     return sorted(places, key=lambda place: -int(place.kept.sum()))
 
 
-def _damage_of(
-    cloud: Cloud, found: Closest, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
-) -> Bools:
+def _damage_of(cloud: Cloud, found: Closest, neighbours: Ints, settings: MaskSettings) -> Bools:
     floor_mm = float(np.median(cloud.sigma_mm)) / np.sqrt(neighbours.shape[1])
-    form_mm = form_of(found.points_mm, found.normals, found.distance_mm, settings.mask)
-    return damaged(found.distance_mm - form_mm, neighbours, floor_mm, settings.mask)
+    form_mm = form_of(found.points_mm, found.normals, found.distance_mm, settings)
+    return damaged(found.distance_mm - form_mm, neighbours, floor_mm, settings)
 
 
 def _alignment(
@@ -178,4 +179,4 @@ def mask_damage(
     """The points (n,) of an aligned cloud that lie on damage, with the points next to it."""
     found = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
     neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
-    return _damage_of(cloud, found, neighbours, nominal, settings)
+    return _damage_of(cloud, found, neighbours, settings.mask)

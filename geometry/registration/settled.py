@@ -12,6 +12,8 @@ from geometry.transforms import apply, inverse
 from geometry.types import Bools, Cloud, Floats
 
 ENDS_MM = 0.01  # standard uncertainty of the surface along a motion beyond which ends of the scan are asked
+LOOKS = 4  # at the ends: how far they reach is told best by points evenly around them
+CLOSE_MM = 0.03  # off their places, from where on another look would see the same
 LEAST_WEIGHT = 1e-3  # of an end beside all points: enough that no step leaves it out
 
 
@@ -35,15 +37,18 @@ def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Sett
     settled = _worth(cloud, fit, resting, nominal)
     if not settled.certainty.sigma_mm[-1] > ENDS_MM:
         return settled
-    moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
-    ends = scan_ends(moved_mm, sound, fit.found, nominal)
-    if not ends:
-        return settled
-    held = _held(ends, settled, nominal)
-    again = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
-    return _with_ends(
-        settled, replace(again, iterations=fit.iterations + again.iterations), held, ends, nominal
-    )
+    turns = fit.iterations
+    for _ in range(LOOKS):
+        moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
+        ends = scan_ends(moved_mm, sound, fit.found, nominal)
+        if not ends:
+            return settled
+        held = _held(ends, fit, settled, nominal)
+        fit = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
+        turns += fit.iterations
+        if max(abs(end.off_mm) for end in ends) < CLOSE_MM:
+            break
+    return _with_ends(settled, replace(fit, iterations=turns), held, ends, nominal)
 
 
 def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
@@ -62,12 +67,12 @@ def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
     )
 
 
-def _held(ends: tuple[End, ...], settled: Settled, nominal: Nominal) -> Held:
-    """The ends, each weighted as the points are: by the variance that these show along the open motion."""
+def _held(ends: tuple[End, ...], fit: Fit, settled: Settled, nominal: Nominal) -> Held:
+    """The ends seen at `fit`, weighted as the points are: by the variance these show along the open one."""
     open_ = settled.certainty.twists[:, -1]
     a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
     least = LEAST_WEIGHT * len(settled.kept)
-    back = inverse(settled.fit.T_nominal_scan)
+    back = inverse(fit.T_nominal_scan)
     return Held(
         points_mm=apply(back, np.array([end.point_mm for end in ends])),
         heights_mm=np.array([end.height_mm for end in ends]),
