@@ -19,10 +19,11 @@ def _cubic(t, weights):  # type: ignore[no-untyped-def]
     weights[3] = t * t * t / 6.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
 def evaluate(points: Floats, counts: Ints, coefficients: Floats) -> Floats:
     """The spline (n, 4) at points (n, 3) inside the lattice; `coefficients` (nodes, 4)."""
     values = np.empty((len(points), 4))
+    grid = coefficients.reshape(counts[2], counts[1], 4 * counts[0])
     u, v, w = np.empty(4), np.empty(4), np.empty(4)
     for p in range(len(points)):
         a = min(max(int(np.floor(points[p, 0])), 0), counts[0] - 4)
@@ -35,12 +36,10 @@ def evaluate(points: Floats, counts: Ints, coefficients: Floats) -> Floats:
         for k in range(4):
             for j in range(4):
                 across = w[k] * v[j]
-                row = ((c + k) * counts[1] + b + j) * counts[0] + a
-                for i in range(4):
-                    weight = across * u[i]
-                    s0 += weight * coefficients[row + i, 0]
-                    s1 += weight * coefficients[row + i, 1]
-                    s2 += weight * coefficients[row + i, 2]
-                    s3 += weight * coefficients[row + i, 3]
+                row = grid[c + k, b + j, 4 * a : 4 * a + 16]
+                s0 += across * (u[0] * row[0] + u[1] * row[4] + u[2] * row[8] + u[3] * row[12])
+                s1 += across * (u[0] * row[1] + u[1] * row[5] + u[2] * row[9] + u[3] * row[13])
+                s2 += across * (u[0] * row[2] + u[1] * row[6] + u[2] * row[10] + u[3] * row[14])
+                s3 += across * (u[0] * row[3] + u[1] * row[7] + u[2] * row[11] + u[3] * row[15])
         values[p, 0], values[p, 1], values[p, 2], values[p, 3] = s0, s1, s2, s3
     return values
