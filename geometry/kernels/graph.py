@@ -85,6 +85,19 @@ def group_medians(owner: Ints, values: Floats, size: int) -> tuple[Floats, Bools
 
 
 @njit(cache=True, nogil=True)
+def window_medians(values: Floats, variances: Floats, windows: Ints) -> tuple[Floats, Floats, Ints]:
+    """Median (m,) of the values (n,) in each window, of which `windows` (2, m) holds first and end; the mean
+    of their variances (n,), and how many there are. 0 where there are none."""
+    medians, means = np.zeros(windows.shape[1]), np.zeros(windows.shape[1])
+    for i in range(windows.shape[1]):
+        first, end = windows[0, i], windows[1, i]
+        if end > first:
+            medians[i] = np.median(values[first:end])
+            means[i] = variances[first:end].mean()
+    return medians, means, windows[1] - windows[0]
+
+
+@njit(cache=True, nogil=True)
 def component_sizes(nearest: Ints, distances: Floats, width: int, reach: float) -> Ints:
     """Size (n,) of the connected component of each point.
 

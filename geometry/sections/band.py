@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse import csr_array
 
+from geometry.kernels.graph import window_medians
 from geometry.kernels.profile_spline import (
     Penalty,
     SplineFit,
@@ -232,12 +233,11 @@ def left_over(band: Band, knots: Knots, fit: SplineFit, chart: Chart) -> tuple[F
     variance_mm2 = fit.scale * np.tile(near.sigma_mm[order] ** 2, 3)
     laps_mm = np.concatenate([arc_mm[order] + lap * chart.perimeter_mm for lap in (-1.0, 0.0, 1.0)])
     middles_mm = np.linspace(0.0, chart.perimeter_mm, max(2, round(chart.perimeter_mm / _NEXT_MM)) + 1)
-    left_mm, sigma_mm = np.zeros(len(middles_mm)), np.full(len(middles_mm), np.inf)
-    for i, middle_mm in enumerate(middles_mm):
-        window = slice(*np.searchsorted(laps_mm, (middle_mm - _NEXT_MM, middle_mm + _NEXT_MM)))
-        if window.stop - window.start >= _NEXT_POINTS:
-            left_mm[i] = np.median(off_mm[window])
-            sigma_mm[i] = _MEDIAN * np.sqrt(variance_mm2[window].mean() / (window.stop - window.start))
+    windows = np.searchsorted(laps_mm, middles_mm + np.array([[-_NEXT_MM], [_NEXT_MM]]))
+    left_mm, mean_mm2, count = window_medians(off_mm, variance_mm2, windows)
+    enough = count >= _NEXT_POINTS
+    left_mm[~enough] = 0.0
+    sigma_mm = np.where(enough, _MEDIAN * np.sqrt(mean_mm2 / np.maximum(count, 1)), np.inf)
     nearest = np.rint(chart.arc_mm[:-1] / middles_mm[1]).astype(np.int64)
     return left_mm[nearest], sigma_mm[nearest]
 

@@ -10,6 +10,7 @@ from geometry.kernels.graph import (
     grow,
     neighbourhood_mean,
     neighbourhood_median,
+    window_medians,
 )
 
 
@@ -79,3 +80,15 @@ def test_medians_of_groups_are_the_lower_ones_of_their_values():
         own = np.sort(values[owner == g])
         assert some[g] == (len(own) > 0)
         assert medians[g] == (own[(len(own) - 1) // 2] if len(own) else 0.0)
+
+
+def test_medians_of_windows_are_those_of_their_slices():
+    rng = np.random.default_rng(9)
+    values, variances = rng.normal(size=(2, 50))
+    first = rng.integers(0, 50, 30)
+    windows = np.stack([first, np.minimum(first + rng.integers(0, 9, 30), 50)])
+    medians, means, count = window_medians(values, variances, windows)
+    for i, (start, end) in enumerate(windows.T):
+        assert count[i] == end - start
+        assert medians[i] == (np.median(values[start:end]) if end > start else 0.0)
+        np.testing.assert_allclose(means[i], variances[start:end].mean() if end > start else 0.0)
