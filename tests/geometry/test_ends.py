@@ -7,7 +7,9 @@ import pytest
 
 from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.registration.ends import on_rim, rims, scan_ends
+from geometry.registration.fit import Fit
 from geometry.registration.register import register
+from geometry.registration.settled import held_by_ends
 from geometry.transforms import apply, inverse, rigid
 from geometry.types import Cloud
 from tests.geometry import blades
@@ -95,6 +97,26 @@ def test_a_screw_is_held_by_its_ends():
     assert off_mm < 0.03
     sigma_mm = np.sqrt(np.linalg.inv(alignment.information)[5, 5])
     assert 0.003 < sigma_mm < 0.03
+
+
+def slid(points_mm, slide_mm):
+    """Where ends hold a scan that lies so far along the screw: a point of it."""
+    turn = np.deg2rad(SCREW.twist_deg) / SCREW.height_mm * slide_mm
+    c, s = np.cos(turn), np.sin(turn)
+    start = rigid(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 0.0, slide_mm]))
+    found = nominal().closest(apply(start, points_mm))
+    count = len(points_mm)
+    cloud = Cloud(points_mm=points_mm, sigma_mm=np.full(count, SIGMA_MM), view=np.zeros(count, np.int64))
+    fit = Fit(T_nominal_scan=start, found=found, weak=(), iterations=0, converged=False)
+    settled = held_by_ends(cloud, fit, np.ones(count, bool), nominal())
+    return apply(settled.fit.T_nominal_scan, points_mm[:1])[0]
+
+
+def test_ends_hold_a_scan_where_they_are_however_far_it_slid():
+    points_mm = open_scan(37)
+    here_mm = slid(points_mm, 0.0)
+    for slide_mm in (-0.4, 0.3):
+        assert np.linalg.norm(slid(points_mm, slide_mm) - here_mm) < 0.002
 
 
 def test_a_screw_cut_short_slides_but_never_confidently():
