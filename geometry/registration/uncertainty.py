@@ -44,11 +44,11 @@ def form_covariance(nominal: Nominal, moved_mm: Floats, found: Closest) -> Float
     off_mm = root * found.distance_mm[few]
     left_mm = off_mm - pose @ (pose.T @ off_mm)
     families = [
-        _family(left_mm, pose, (root * shape)[:, None] * chordwise, spanwise)
+        _family(left_mm, pose, root * shape, chordwise, spanwise)
         for shape, chordwise, spanwise in _patterns(nominal, feet_mm, normals)
     ]
-    noise = _noise(families)
-    spread = np.sum([family.leaked(noise) for family in families], axis=0)
+    noise_mm2 = _noise_mm2(families)
+    spread = np.sum([family.leaked(noise_mm2) for family in families], axis=0)
     bulge = pose.T @ (root * nominal.bulge_mm[found.face[few]])
     spread += np.outer(bulge, bulge)
     back = whiten * scale[:, None]
@@ -102,29 +102,34 @@ class Family:
     power: Floats
     seen: Floats
     leaks: Floats  # (6, i, j)
+    stands_for: float  # points that each of its points stands for, by which the power of noise grows
 
     @property
     def frequency(self) -> Floats:
         return np.asarray(np.hypot(*np.indices(self.power.shape)))
 
-    def leaked(self, noise: float) -> Floats:
+    def leaked(self, noise_mm2: float) -> Floats:
         """Covariance (6, 6) that the form gives to the pose, in the motions of unit size."""
-        return np.asarray(np.einsum("ij,kij,lij->kl", _form_power(self, noise), self.leaks, self.leaks))
+        form = _form_power(self, noise_mm2 * self.stands_for)
+        return np.asarray(np.einsum("ij,kij,lij->kl", form, self.leaks, self.leaks))
 
 
-def _family(left_mm: Floats, pose: Floats, chordwise: Floats, spanwise: Floats) -> Family:
+def _family(left_mm: Floats, pose: Floats, shape: Floats, chordwise: Floats, spanwise: Floats) -> Family:
+    chordwise = shape[:, None] * chordwise
     size = np.sqrt(np.maximum((chordwise**2).T @ spanwise**2, 1e-12))
     power = (((chordwise * left_mm[:, None]).T @ spanwise) / size) ** 2
     leaks = np.stack([((chordwise * motion[:, None]).T @ spanwise) / size for motion in pose.T])
-    return Family(power=power, seen=np.clip(1.0 - np.sum(leaks**2, axis=0), 0.0, 1.0), leaks=leaks)
+    seen = np.clip(1.0 - np.sum(leaks**2, axis=0), 0.0, 1.0)
+    stands_for = max(float(np.sum(shape**2)) / max(np.count_nonzero(shape), 1), 1.0)
+    return Family(power=power, seen=seen, leaks=leaks, stands_for=stands_for)
 
 
-def _noise(families: list[Family]) -> float:
-    """Power of a pattern that is noise alone: the median over the fine patterns of all families."""
+def _noise_mm2(families: list[Family]) -> float:
+    """Variance of the noise of a point: the median over the fine patterns of all families."""
     powers = []
     for family in families:
         fine = family.frequency >= FINE * family.frequency.max()
-        powers.append(family.power[fine] / np.maximum(family.seen[fine], 0.1))
+        powers.append(family.power[fine] / np.maximum(family.seen[fine], 0.1) / family.stands_for)
     return float(np.median(np.concatenate(powers))) / MEDIAN
 
 

@@ -22,13 +22,14 @@ def nominal(blade=BLADE):
 
 
 @cache
-def exact(blade=BLADE):
-    return nominal(blade).closest(blades.scan(blade, 0.4, np.random.default_rng(1)).points_mm)
+def exact(blade=BLADE, per_mm2=0.4):
+    return nominal(blade).closest(blades.scan(blade, per_mm2, np.random.default_rng(1)).points_mm)
 
 
-def fitted(residual_mm, blade=BLADE):
+def fitted(residual_mm, blade=BLADE, per_mm2=0.4):
     """The twist that least squares gives points off the surface by `residual_mm`, and the stated parts."""
-    points_mm = exact(blade).points_mm + residual_mm[:, None] * exact(blade).normals
+    feet = exact(blade, per_mm2)
+    points_mm = feet.points_mm + residual_mm[:, None] * feet.normals
     found = nominal(blade).closest(points_mm)
     start = Fit(T_nominal_scan=np.eye(4), found=found, weak=(), iterations=0, converged=False)
     fit = fit_kept(points_mm, start, np.ones(len(points_mm), bool), nominal(blade))
@@ -97,16 +98,17 @@ def test_waves_are_stated_within_a_factor_of_a_few(along, waves):
     assert ((spread > 0.1) & (spread < 2.0)).all()
 
 
-def test_waves_on_the_end_face_that_holds_the_height_are_stated():
+@pytest.mark.parametrize(("per_mm2", "noise_mm"), [(0.4, 0.001), (5.0, 0.1)])
+def test_waves_on_the_end_face_that_holds_the_height_are_stated(per_mm2, noise_mm):
     """Its few points are no surer than the waves on them are high, however many lie on the walls."""
     rng = np.random.default_rng(7)
-    found = exact(SCREW)
+    found = exact(SCREW, per_mm2)
     lid = nominal(SCREW).tip_face[found.face]
     residuals = []
     for _ in range(12):
         turn = 2.0 * np.pi * (2.3 * found.points_mm[:, 0] / SCREW.chord_mm + rng.random())
-        residuals.append(lid * 0.03 * np.sin(turn) + rng.normal(scale=0.001, size=len(lid)))
-    fits = [fitted(residual, SCREW) for residual in residuals]
+        residuals.append(lid * 0.03 * np.sin(turn) + rng.normal(scale=noise_mm, size=len(lid)))
+    fits = [fitted(residual, SCREW, per_mm2) for residual in residuals]
     off_mm = np.sqrt(np.mean([twist[5] ** 2 for twist, _, _ in fits]))
     stated_mm = np.sqrt(np.mean([form[5, 5] for _, _, form in fits]))
     assert off_mm > 0.001
