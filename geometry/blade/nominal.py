@@ -35,6 +35,11 @@ SPAN_SLACK = (
 UP = 0.7  # the z of a unit normal that looks up rather than sideways
 
 
+def of_end_faces(normals: Floats) -> Bools:
+    """Which unit normals (n, 3) look up or down rather than sideways, as those of end faces do."""
+    return np.asarray(np.abs(normals[:, 2]) > UP)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NominalSettings:
     """What the plan says of the nominal. None: from just above the root end face to the tip."""

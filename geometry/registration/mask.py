@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from geometry.blade.nominal import UP
+from geometry.blade.nominal import of_end_faces
 from geometry.errors import BadInput
 from geometry.kernels.form import blend, local_fits
 from geometry.kernels.graph import dilate, grow, neighbourhood_mean, neighbourhood_median
@@ -109,7 +109,7 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
 def _sampled(place: Floats, normals: Floats, settings: MaskSettings) -> Ints:
     """Indices of points evenly through all, and of more of them on end faces: these are small, and hold z."""
     looked_at = _every_nth(len(place), LOOKED_AT * settings.form_points)
-    lid = np.flatnonzero(np.abs(normals[:, 2]) > UP)
+    lid = np.flatnonzero(of_end_faces(normals))
     return np.union1d(
         looked_at[_one_to_a_cell(place[looked_at], settings.form_points)],
         lid[_every_nth(len(lid), settings.form_points // LIDS)],

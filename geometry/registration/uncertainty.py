@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from geometry.blade.nominal import UP, Closest, Nominal
+from geometry.blade.nominal import Closest, Nominal, of_end_faces
 from geometry.blade.span import on_line_mm
 from geometry.registration.fit import every, motions, unit_motions
-from geometry.types import Bools, Floats, Ints
+from geometry.types import Floats, Ints
 
-POINTS = 12_000
+POINTS = 12_000  # of the walls
 ON_ENDS = 3_000  # of end faces beside them: of the few that these have, a part would tell noise for form
 WAVES = 28  # half waves along the chord and along the span, at most
 POINTS_A_WAVE = 8  # at least so many points a pattern
@@ -57,7 +57,7 @@ def form_covariance(nominal: Nominal, moved_mm: Floats, found: Closest) -> Float
 
 def _sampled(normals: Floats) -> tuple[Ints, Floats]:
     """Indices (k,) of points, apart on walls and on end faces, and the root of how many each stands for."""
-    lid = np.abs(normals[:, 2]) > UP
+    lid = of_end_faces(normals)
     walls, ends = np.flatnonzero(~lid), np.flatnonzero(lid)
     of_walls, of_ends = walls[every(len(walls), POINTS)], ends[every(len(ends), ON_ENDS)]
     stands_for = np.repeat(
@@ -79,7 +79,7 @@ def _patterns(nominal: Nominal, feet_mm: Floats, normals: Floats) -> list[tuple[
     along = np.sum((feet_mm[:, :2] - le_mm) * chord, axis=1) / np.sum(chord**2, axis=1)
     up = (z_mm - z_mm.min()) / max(float(np.ptp(z_mm)), 1e-9)
     side = np.where(chord[:, 0] * normals[:, 1] > chord[:, 1] * normals[:, 0], 1.0, -1.0)
-    lid: Bools = np.abs(normals[:, 2]) > UP
+    lid = of_end_faces(normals)
     patterns = len(feet_mm) // POINTS_A_WAVE
     chordwise, spanwise = (_cosines(place, int(np.sqrt(patterns))) for place in (along, up))
     wall = (~lid).astype(np.float64)
@@ -120,7 +120,7 @@ def _family(left_mm: Floats, pose: Floats, shape: Floats, chordwise: Floats, spa
     power = (((chordwise * left_mm[:, None]).T @ spanwise) / size) ** 2
     leaks = np.stack([((chordwise * motion[:, None]).T @ spanwise) / size for motion in pose.T])
     seen = np.clip(1.0 - np.sum(leaks**2, axis=0), 0.0, 1.0)
-    stands_for = max(float(np.sum(shape**2)) / max(np.count_nonzero(shape), 1), 1.0)
+    stands_for = max(float(np.sum(shape**2)) / max(int(np.count_nonzero(shape)), 1), 1.0)
     return Family(power=power, seen=seen, leaks=leaks, stands_for=stands_for)
 
 
