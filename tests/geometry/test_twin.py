@@ -11,7 +11,7 @@ import pytest
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.blade.read import read_nominal
 from geometry.blade.solid import check_solid
-from geometry.deformation.twin import Twin, TwinSettings, fit_twin
+from geometry.deformation.twin import Twin, TwinSettings, fit_twin, settled
 from geometry.errors import CannotFitTwin
 from geometry.transforms import apply, exp, inverse
 from geometry.types import Bools, Floats, Measurand, Mesh
@@ -217,3 +217,23 @@ def test_a_real_blade_with_platform_and_root() -> None:
     assert twin.sigma_mm[: len(true)][off].mean() > 10.0 * twin.sigma_mm[: len(true)][sound].mean()
     assert not twin.supported[: len(true)][off].any() or twin.supported[: len(true)][off].mean() < 0.01
     assert np.linalg.norm(twin.displacement_mm[: len(true)][off], axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("share", "moved_mm", "rests"),
+    [
+        (0.0, 0.0, True),
+        (0.0005, 0.011, True),
+        (0.0005, 0.05, False),
+        (0.01, 0.011, False),
+        (1.0, 0.005, True),
+    ],
+)
+def test_rounds_settle_though_a_place_at_a_rim_comes_and_goes(share, moved_mm, rests):
+    """Of 20,000 sound points some move, beside damage that begins at 0.03 mm."""
+    moved = np.where(np.arange(20_000) < share * 20_000, moved_mm, 0.0)
+    assert settled(moved, 0.03) is rests
+
+
+def test_no_points_move_nowhere():
+    assert settled(np.zeros(0), 0.03)
