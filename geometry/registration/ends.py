@@ -17,7 +17,8 @@ RIM_MM = 0.1  # from a rim: there a foot may be on either face, whichever noise 
 WINDOW_MM = 1.0  # of the wall's points on both sides of an end
 CLEAR_MM = 1.0  # from damage
 LEAST = 100  # points in the window
-LIT = 5  # points on a face beyond a rim that make it seen
+LIT = 5  # points on a face beyond a rim that make it seen ...
+INWARD_MM = 0.3  # ... so far from it: nearer to it lie feet of a wall that slid past its end, too
 SHARE = 0.05  # of the points that a tip face would have, below which it is not seen
 SHARPEST_MM, BLUNTEST_MM = 5e-4, 0.08  # blur of an end; beyond, it is ragged
 BLURS_MM = (0.002, 0.01, 0.04)  # to start from: the likelihood has a ridge
@@ -79,13 +80,13 @@ def _steep(nominal: Nominal) -> Bools:
     return np.asarray(np.abs(normal[:, 2]) < UP * np.linalg.norm(normal, axis=1))
 
 
-def on_rim(nominal: Nominal, points_mm: Floats) -> Bools:
-    """Which points (n, 3) of the nominal's surface lie within a tenth of a millimetre of a rim."""
+def on_rim(nominal: Nominal, points_mm: Floats, reach_mm: float = RIM_MM) -> Bools:
+    """Which points (n, 3) of the nominal's surface lie as near as that to a rim."""
     close = np.zeros(len(points_mm), bool)
     for rim in rims(nominal):
         z_mm = points_mm[:, 2]
-        near = np.flatnonzero((z_mm >= rim.low_mm - RIM_MM) & (z_mm <= rim.high_mm + RIM_MM))
-        apart_mm, _ = rim.tree.query(points_mm[near], distance_upper_bound=RIM_MM)
+        near = np.flatnonzero((z_mm >= rim.low_mm - reach_mm) & (z_mm <= rim.high_mm + reach_mm))
+        apart_mm, _ = rim.tree.query(points_mm[near], distance_upper_bound=reach_mm)
         close[near[np.isfinite(apart_mm)]] = True
     return close
 
@@ -111,12 +112,12 @@ def _end(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nomi
     past_mm = outward * (moved_mm[:, 2] - height_mm)
     near = np.flatnonzero(np.abs(past_mm) < WINDOW_MM)
     wall = near[sound[near]]
-    if rim.high_mm - rim.low_mm > LEVEL_MM or _seen(wall, found, nominal) >= LIT:
+    if rim.high_mm - rim.low_mm > LEVEL_MM:
         return None
     if not sound[near].all():
         apart_mm, _ = cKDTree(moved_mm[near[~sound[near]]]).query(moved_mm[wall])
         wall = wall[apart_mm > CLEAR_MM]
-    if len(wall) < LEAST:
+    if len(wall) < LEAST or _seen(wall, found, nominal) >= LIT:
         return None
     stop_mm, blur_mm = _step(past_mm[wall])
     if not blur_mm < BLUNTEST_MM:
@@ -142,7 +143,7 @@ def _seen(near: Ints, found: Closest, nominal: Nominal) -> int:
     """How many of the points near an end lie on the face beyond its rim."""
     face, feet_mm = found.face[near], found.points_mm[near]
     lid = nominal.tip_face[face] | nominal.end_face[face]
-    return int(np.count_nonzero(~on_rim(nominal, feet_mm[lid])))
+    return int(np.count_nonzero(~on_rim(nominal, feet_mm[lid], INWARD_MM)))
 
 
 def _step(past_mm: Floats) -> tuple[float, float]:

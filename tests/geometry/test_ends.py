@@ -91,6 +91,12 @@ def test_a_seen_tip_face_needs_no_end():
     assert ends_of(scan.points_mm) == ()
 
 
+def test_a_worn_wall_that_slid_past_its_end_is_no_tip_face():
+    points_mm = open_scan(36)
+    worn_mm = points_mm - 0.15 * nominal().closest(points_mm).normals * [1.0, 1.0, 0.0]
+    assert len(ends_of(worn_mm + np.array([0.0, 0.0, 0.4]))) == 2
+
+
 def test_a_screw_is_held_by_its_ends():
     alignment, off_mm = registered(open_scan(33))
     assert alignment.weak_directions == ()
