@@ -10,7 +10,9 @@ FARTHEST = 700.0  # beyond, as good as nothing
 BIAS, FRACTION_BITS = 1023, 52  # of a double's exponent
 
 
-@njit(cache=True, nogil=True)
+@njit(
+    cache=True, nogil=True, fastmath=False
+)  # unsaid, it would take its first caller's freedom and lose digits
 def decay(a: float) -> float:
     """exp(-a) for a >= 0, to the last bit or two; from `FARTHEST` on it falls no further.
 
