@@ -10,9 +10,8 @@ FARTHEST = 700.0  # beyond, as good as nothing
 BIAS, FRACTION_BITS = 1023, 52  # of a double's exponent
 
 
-@njit(
-    cache=True, nogil=True, fastmath=False
-)  # unsaid, it would take its first caller's freedom and lose digits
+# fastmath=False: unsaid, it would take the freedom of whoever compiles it first, and lose digits.
+@njit(cache=True, nogil=True, fastmath=False)
 def decay(a: float) -> float:
     """exp(-a) for a >= 0, to the last bit or two; from `FARTHEST` on it falls no further.
 
