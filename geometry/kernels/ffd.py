@@ -19,7 +19,7 @@ def _cubic(t, weights):  # type: ignore[no-untyped-def]
     weights[3] = t * t * t / 6.0
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@njit(cache=True, nogil=True)
 def evaluate(points: Floats, counts: Ints, coefficients: Floats) -> Floats:
     """The spline (n, 4) at points (n, 3) inside the lattice; `coefficients` (nodes, 4)."""
     values = np.empty((len(points), 4))

@@ -81,7 +81,7 @@ def _steep(nominal: Nominal) -> Bools:
 
 
 def on_rim(nominal: Nominal, points_mm: Floats, reach_mm: float = RIM_MM) -> Bools:
-    """Which points (n, 3) of the nominal's surface lie as near as that to a rim."""
+    """Which points (n, 3) of the nominal's surface lie within `reach_mm` of a rim."""
     close = np.zeros(len(points_mm), bool)
     for rim in rims(nominal):
         z_mm = points_mm[:, 2]
@@ -107,13 +107,13 @@ def scan_ends(moved_mm: Floats, sound: Bools, found: Closest, nominal: Nominal) 
 
 
 def _end(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nominal) -> End | None:
+    if rim.high_mm - rim.low_mm > LEVEL_MM:
+        return None
     height_mm = 0.5 * (rim.low_mm + rim.high_mm)
     outward = 1.0 if height_mm > nominal.pivot_mm[2] else -1.0
     past_mm = outward * (moved_mm[:, 2] - height_mm)
     near = np.flatnonzero(np.abs(past_mm) < WINDOW_MM)
     wall = near[sound[near]]
-    if rim.high_mm - rim.low_mm > LEVEL_MM:
-        return None
     if not sound[near].all():
         apart_mm, _ = cKDTree(moved_mm[near[~sound[near]]]).query(moved_mm[wall])
         wall = wall[apart_mm > CLEAR_MM]
@@ -140,7 +140,7 @@ def without_strays(sound: Bools, found: Closest, nominal: Nominal) -> Bools:
 
 
 def _seen(near: Ints, found: Closest, nominal: Nominal) -> int:
-    """How many of the points near an end lie on the face beyond its rim."""
+    """How many of the points near an end lie well inside the face beyond its rim."""
     face, feet_mm = found.face[near], found.points_mm[near]
     lid = nominal.tip_face[face] | nominal.end_face[face]
     return int(np.count_nonzero(~on_rim(nominal, feet_mm[lid], INWARD_MM)))

@@ -29,15 +29,12 @@ class RegisterSettings:
     robust_points: int = 8000  # of the cloud, for the robust fit
     fit_points: int = 250_000  # of the cloud, for mask and least squares: 0.0005 mm of noise at most
     rounds: int = 2  # of mask and least squares
-    fit_ring: int = 0  # the mask's ring for these: each sound point left out lets form into the pose
     explained_mm: float = 0.3
     loose_mm: float = 0.3  # standard uncertainty of the surface along a motion that makes it a free one
     slide_mm: float = 0.05  # the same, beyond which other places along that motion are tried
 
     def __post_init__(self) -> None:
-        if not (
-            self.least_points >= 50 and self.robust_points >= 500 and min(self.rounds, self.fit_ring + 1) >= 1
-        ):
+        if not (self.least_points >= 50 and self.robust_points >= 500 and self.rounds >= 1):
             raise BadInput(f"register: {self} asks for too few points or rounds")
         if not min(self.explained_mm, self.loose_mm, self.slide_mm) > 0.0:
             raise BadInput(f"register: {self} has a distance that is none")
@@ -78,7 +75,8 @@ def _settled(
 ) -> Settled:
     """Rounds of mask and least squares on the whole cloud."""
     found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
-    fit, mask = replace(start, found=found), replace(settings.mask, ring=settings.fit_ring)
+    fit = replace(start, found=found)
+    mask = replace(settings.mask, ring=0)  # sound points left out let form into the pose
     for _ in range(settings.rounds):
         sound = ~_damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, mask)
         held = int((sound & felt(nominal, fit.found)).sum())

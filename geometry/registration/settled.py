@@ -32,6 +32,9 @@ class Settled:
 def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
     """What a least-squares pose on the sound points (n,) is worth; where these leave a motion open and the
     scan stops sharply at both ends of the nominal, the pose that lays these ends on it, too.
+
+    An end is told worse the further it is from its place: each pose that ends gave is the next one to look
+    from.
     """
     resting = without_strays(sound, fit.found, nominal)
     settled = _worth(cloud, fit, resting, nominal)
@@ -68,7 +71,7 @@ def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
 
 
 def _held(ends: tuple[End, ...], fit: Fit, settled: Settled, nominal: Nominal) -> Held:
-    """The ends seen at `fit`, weighted as the points are: by the variance these show along the open one."""
+    """The ends seen at `fit`, weighted as points are: by the variance that these show along the open one."""
     open_ = settled.certainty.twists[:, -1]
     a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
     least = LEAST_WEIGHT * len(settled.kept)

@@ -235,5 +235,5 @@ def test_rounds_settle_though_a_place_at_a_rim_comes_and_goes(share, moved_mm, r
     assert settled(moved, 0.03) is rests
 
 
-def test_no_points_move_nowhere():
+def test_without_points_nothing_moves():
     assert settled(np.zeros(0), 0.03)
