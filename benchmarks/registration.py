@@ -36,6 +36,7 @@ from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.blade.read import read_nominal
 from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import CoarseSettings, find_pose
+from geometry.registration.ends import without_strays
 from geometry.registration.fit import Fit, fit_kept, motions
 from geometry.registration.register import mask_damage, register
 from geometry.registration.settled import held_by_ends
@@ -147,7 +148,8 @@ def known_pose(case: Case, nominal: Nominal) -> Floats:
     start = Fit(T_nominal_scan=case.T_true, found=found, weak=(), iterations=0, converged=False)
     sound = case.scan.depth_mm == 0.0
     fit = fit_kept(case.cloud.points_mm, start, sound, nominal, steps=20, close_mm=1e-7)
-    return held_by_ends(case.cloud, fit, sound, nominal).fit.T_nominal_scan
+    resting = without_strays(sound, sound, fit.found, nominal)
+    return held_by_ends(case.cloud, fit, sound, resting, nominal).fit.T_nominal_scan
 
 
 def sectional_rmse(case: Case, T: Floats, nominal: Nominal) -> Floats:

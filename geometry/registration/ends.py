@@ -130,13 +130,14 @@ def _end(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nomi
     return End(point_mm=point_mm, height_mm=height_mm, sigma_mm=sigma_mm)
 
 
-def without_strays(sound: Bools, found: Closest, nominal: Nominal) -> Bools:
-    """The sound points (n,) less those on a tip face that only a few lie on, which no seen face would have:
-    a point or two that damage left near it by chance would hold the height of all.
+def without_strays(sound: Bools, clear: Bools, found: Closest, nominal: Nominal) -> Bools:
+    """The sound points (n,) less those on a tip face where only a few of them are clear of damage, fewer than
+    any seen face would have: what a break leaves near it by chance would hold the height of all.
     """
     lid = sound & nominal.tip_face[found.face] & ~on_rim(nominal, found.points_mm)
     expected = float(np.count_nonzero(sound)) * float(nominal.samples.tip_face.mean())
-    return np.asarray(sound & ~lid) if np.count_nonzero(lid) < max(LIT, SHARE * expected) else sound
+    seen = np.count_nonzero(lid & clear) >= max(LIT, SHARE * expected)
+    return sound if seen else np.asarray(sound & ~lid)
 
 
 def _seen(near: Ints, found: Closest, nominal: Nominal) -> int:

@@ -55,13 +55,13 @@ class MaskSettings:
 
 
 def damaged(residual_mm: Floats, neighbours: Ints, floor_mm: float, settings: MaskSettings) -> Bools:
-    """The points (n,) whose neighbourhood lies off the surface, with a narrow ring around them.
+    """The points (n,) whose neighbourhood lies off the surface.
 
     `residual_mm` (n,) is signed, `neighbours` (n, k) of each point, itself among them. The mean over a
     neighbourhood keeps what damage does and averages noise away; its robust scatter, but at least
     `floor_mm`, is the scale. From seeds beyond `high` scales the flag grows over the neighbour graph down
     to `low`. As the mean carries damage a neighbourhood beyond its rim, points there that are not off
-    themselves and most of whose neighbours are not are let go, before the nearest ones of the rest join it.
+    themselves and most of whose neighbours are not are let go.
     """
     smooth_mm = neighbourhood_mean(residual_mm, neighbours[:, 1:])
     scale_mm = max(robust_sigma(smooth_mm), floor_mm, settings.exact_mm)
@@ -71,8 +71,12 @@ def damaged(residual_mm: Floats, neighbours: Ints, floor_mm: float, settings: Ma
     scatter_mm = max(robust_sigma(residual_mm), scale_mm)
     beside = most_mm <= min(settings.low * MEDIAN * scale_mm, settings.shallow_mm)
     let_go = beside & (np.abs(residual_mm) <= settings.own * scatter_mm)
-    ring = np.ascontiguousarray(neighbours[:, : settings.ring + 1])
-    return np.asarray(dilate(reached & ~let_go, ring))
+    return np.asarray(reached & ~let_go)
+
+
+def ringed(damage: Bools, neighbours: Ints, settings: MaskSettings) -> Bools:
+    """Damage (n,) with a narrow ring around it: the `ring` nearest neighbours of each of its points."""
+    return np.asarray(dilate(damage, np.ascontiguousarray(neighbours[:, : settings.ring + 1])))
 
 
 def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: MaskSettings) -> Floats:

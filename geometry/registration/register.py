@@ -10,7 +10,7 @@ from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import Coarse, CoarseSettings, find_pose
 from geometry.registration.ends import on_rim, without_strays
 from geometry.registration.fit import Fit, every, felt, fit_kept, fit_robust, unit_twist
-from geometry.registration.mask import MaskSettings, damaged, form_of
+from geometry.registration.mask import MaskSettings, damaged, form_of, ringed
 from geometry.registration.settled import Settled, held_by_ends
 from geometry.registration.size import check_size
 from geometry.registration.slide import LEAST, slides_mm
@@ -73,18 +73,23 @@ def _thinned(cloud: Cloud, most: int) -> Cloud:
 def _settled(
     cloud: Cloud, start: Fit, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
 ) -> Settled:
-    """Rounds of mask and least squares on the whole cloud."""
+    """Rounds of mask and least squares on the whole cloud.
+
+    The fit rests on the ring round damage, too: each sound point left out lets form into the pose.
+    """
     found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
     fit = replace(start, found=found)
-    mask = replace(settings.mask, ring=0)  # sound points left out let form into the pose
     for _ in range(settings.rounds):
-        sound = ~_damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, mask)
+        damage = _damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, settings.mask)
+        sound, clear = ~damage, ~ringed(damage, neighbours, settings.mask)
         held = int((sound & felt(nominal, fit.found)).sum())
         if held < settings.least_points:
             raise CannotRegister(f"{held} scan points lie on the nominal")
-        fit = fit_kept(cloud.points_mm, fit, without_strays(sound, fit.found, nominal), nominal)
+        resting = without_strays(sound, clear, fit.found, nominal)
+        fit = fit_kept(cloud.points_mm, fit, resting, nominal)
         turns += fit.iterations
-    return held_by_ends(cloud, replace(fit, iterations=turns), sound, nominal)
+    resting = without_strays(sound, clear, fit.found, nominal)
+    return held_by_ends(cloud, replace(fit, iterations=turns), sound, resting, nominal)
 
 
 def _past_rims_none(found: Closest, nominal: Nominal) -> Closest:
@@ -177,4 +182,4 @@ def mask_damage(
     """The points (n,) of an aligned cloud that lie on damage, with the points next to it."""
     found = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
     neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
-    return _damage_of(cloud, found, neighbours, settings.mask)
+    return ringed(_damage_of(cloud, found, neighbours, settings.mask), neighbours, settings.mask)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.blade.nominal import Nominal
-from geometry.registration.ends import End, scan_ends, without_strays
+from geometry.registration.ends import End, scan_ends
 from geometry.registration.fit import Fit, Held, felt, fit_kept, information, motions, unit_motions
 from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
 from geometry.transforms import apply, inverse
@@ -13,7 +13,7 @@ from geometry.types import Bools, Cloud, Floats
 
 ENDS_MM = 0.01  # standard uncertainty of the surface along a motion beyond which ends of the scan are asked
 LOOKS = 4  # at the ends: how far they reach is told best by points evenly around them
-CLOSE_MM = 0.03  # off their places, from where on another look would see the same
+CLOSE_MM = 0.03  # that a look at the ends moves them, from where on another would see the same
 LEAST_WEIGHT = 1e-3  # of an end beside all points: enough that no step leaves it out
 
 
@@ -29,29 +29,31 @@ class Settled:
     certainty: Certainty
 
 
-def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
-    """What a least-squares pose on the sound points (n,) is worth; where these leave a motion open and the
-    scan stops sharply at both ends of the nominal, the pose that lays these ends on it, too.
+def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, resting: Bools, nominal: Nominal) -> Settled:
+    """What a least-squares pose on the `resting` points (n,) is worth; where these leave a motion open, and
+    the scan, as far as it is sound (n,), stops sharply at both ends of the nominal, the pose that lays these
+    ends on it, too.
 
     An end is told worse the further it is from its place: each pose that ends gave is the next one to look
-    from.
+    from, until one stays. If none does, the fit has not converged.
     """
-    resting = without_strays(sound, fit.found, nominal)
     settled = _worth(cloud, fit, resting, nominal)
     if not settled.certainty.sigma_mm[-1] > ENDS_MM:
         return settled
     turns = fit.iterations
     for _ in range(LOOKS):
-        moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
-        ends = scan_ends(moved_mm, sound, fit.found, nominal)
+        ends = scan_ends(apply(fit.T_nominal_scan, cloud.points_mm), sound, fit.found, nominal)
         if not ends:
             return settled
         held = _held(ends, fit, settled, nominal)
         fit = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
         turns += fit.iterations
-        if max(abs(end.off_mm) for end in ends) < CLOSE_MM:
+        moved_mm = held.rows(fit.T_nominal_scan, nominal.pivot_mm).off_mm - [end.off_mm for end in ends]
+        stays = bool(np.abs(moved_mm).max() < CLOSE_MM)
+        if stays:
             break
-    return _with_ends(settled, replace(fit, iterations=turns), held, ends, nominal)
+    fit = replace(fit, iterations=turns, converged=fit.converged and stays)
+    return _with_ends(settled, fit, held, ends, nominal)
 
 
 def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:

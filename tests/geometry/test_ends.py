@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.blade.nominal import NominalSettings, prepare_nominal
-from geometry.registration.ends import on_rim, rims, scan_ends
+from geometry.registration.ends import on_rim, rims, scan_ends, without_strays
 from geometry.registration.fit import Fit
 from geometry.registration.register import register
 from geometry.registration.settled import held_by_ends
@@ -91,6 +91,30 @@ def test_a_seen_tip_face_needs_no_end():
     assert ends_of(scan.points_mm) == ()
 
 
+def tip_and_walls(on_tip):
+    """Points of the walls, and behind them so many of the tip face; their feet, and which lie on the tip."""
+    scan = blades.scan(SCREW, 3.0, np.random.default_rng(35))
+    tip = np.flatnonzero(scan.normals[:, 2] > 0.9)
+    points_mm = scan.points_mm[
+        np.concatenate([np.setdiff1d(np.arange(len(scan.points_mm)), tip), tip[:on_tip]])
+    ]
+    found = nominal().closest(points_mm)
+    on_lid = nominal().tip_face[found.face] & ~on_rim(nominal(), found.points_mm)
+    return found, on_lid
+
+
+@pytest.mark.parametrize(
+    ("on_tip", "beside_damage", "rests"), [(3, 0, False), (200, 0, True), (200, 197, False)]
+)
+def test_a_tip_face_counts_where_enough_of_it_is_clear_of_damage(on_tip, beside_damage, rests):
+    found, on_lid = tip_and_walls(on_tip)
+    sound, clear = np.ones(len(on_lid), bool), np.ones(len(on_lid), bool)
+    clear[len(clear) - beside_damage :] = False
+    resting = without_strays(sound, clear, found, nominal())
+    assert resting[~on_lid].all()
+    assert resting[on_lid].all() if rests else not resting[on_lid].any()
+
+
 def test_a_worn_wall_that_slid_past_its_end_is_no_tip_face():
     points_mm = open_scan(36)
     worn_mm = points_mm - 0.15 * nominal().closest(points_mm).normals * [1.0, 1.0, 0.0]
@@ -106,7 +130,7 @@ def test_a_screw_is_held_by_its_ends():
 
 
 def slid(points_mm, slide_mm):
-    """Where ends hold a scan that lies so far along the screw: a point of it."""
+    """The fit that ends make of a scan that lies so far along the screw."""
     turn = np.deg2rad(SCREW.twist_deg) / SCREW.height_mm * slide_mm
     c, s = np.cos(turn), np.sin(turn)
     start = rigid(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 0.0, slide_mm]))
@@ -114,15 +138,24 @@ def slid(points_mm, slide_mm):
     count = len(points_mm)
     cloud = Cloud(points_mm=points_mm, sigma_mm=np.full(count, SIGMA_MM), view=np.zeros(count, np.int64))
     fit = Fit(T_nominal_scan=start, found=found, weak=(), iterations=0, converged=False)
-    settled = held_by_ends(cloud, fit, np.ones(count, bool), nominal())
-    return apply(settled.fit.T_nominal_scan, points_mm[:1])[0]
+    return held_by_ends(cloud, fit, np.ones(count, bool), np.ones(count, bool), nominal()).fit
 
 
 def test_ends_hold_a_scan_where_they_are_however_far_it_slid():
     points_mm = open_scan(37)
-    here_mm = slid(points_mm, 0.0)
+    here = slid(points_mm, 0.0)
     for slide_mm in (-0.4, 0.3):
-        assert np.linalg.norm(slid(points_mm, slide_mm) - here_mm) < 0.002
+        there = slid(points_mm, slide_mm)
+        apart_mm = apply(there.T_nominal_scan, points_mm[:1]) - apply(here.T_nominal_scan, points_mm[:1])
+        assert np.linalg.norm(apart_mm) < 0.002
+        assert there.converged
+
+
+def test_ends_that_still_move_the_scan_have_not_converged(monkeypatch):
+    monkeypatch.setattr("geometry.registration.settled.LOOKS", 1)
+    points_mm = open_scan(37)
+    assert slid(points_mm, 0.0).converged
+    assert not slid(points_mm, -0.4).converged
 
 
 def test_a_screw_cut_short_slides_but_never_confidently():

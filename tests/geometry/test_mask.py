@@ -6,7 +6,7 @@ import pytest
 from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.errors import BadInput
 from geometry.kernels.neighbours import k_nearest
-from geometry.registration.mask import MaskSettings, damaged, form_of
+from geometry.registration.mask import MaskSettings, damaged, form_of, ringed
 from geometry.registration.register import mask_damage
 from geometry.robust import robust_sigma
 from geometry.types import Cloud
@@ -21,6 +21,11 @@ def plate(rng, sigma_mm):
     return points, rng.normal(scale=sigma_mm, size=8000) - depth, depth
 
 
+def flagged(residual, neighbours, floor_mm):
+    """Damage and the ring around it."""
+    return ringed(damaged(residual, neighbours, floor_mm, MaskSettings()), neighbours, MaskSettings())
+
+
 def test_robust_sigma_is_the_sigma_and_ignores_outliers():
     values = np.random.default_rng(1).normal(3.0, 0.5, 20_000)
     assert robust_sigma(values) == pytest.approx(0.5, rel=0.02)
@@ -30,7 +35,7 @@ def test_robust_sigma_is_the_sigma_and_ignores_outliers():
 @pytest.mark.parametrize("sigma", [0.0, 0.015, 0.03])
 def test_damage_deeper_than_three_sigma_is_found_and_little_else(sigma):
     points, residual, depth = plate(np.random.default_rng(2), sigma)
-    flags = damaged(residual, k_nearest(points, 17)[0], max(sigma, 1e-4) / 4.0, MaskSettings())
+    flags = flagged(residual, k_nearest(points, 17)[0], max(sigma, 1e-4) / 4.0)
     assert flags[depth > 3.0 * max(sigma, 0.001)].mean() > 0.99
     assert flags[np.hypot(*points[:, :2].T) > 4.0].mean() < 0.005
 
@@ -40,7 +45,7 @@ def test_beside_a_steep_rim_only_the_nearest_points_are_lost():
     radius = np.hypot(*points[:, :2].T)
     residual = np.where(radius < 4.0, residual - 2.0, residual)
     nearest, apart = k_nearest(points, 17)
-    flags = damaged(residual, nearest, 0.0025, MaskSettings())
+    flags = flagged(residual, nearest, 0.0025)
     assert flags[radius < 4.0].all()
     reach = 4.0 + np.quantile(apart[:, 5], 0.99)
     assert flags[radius > reach].mean() < 0.001
@@ -49,7 +54,7 @@ def test_beside_a_steep_rim_only_the_nearest_points_are_lost():
 def test_excess_counts_as_much_as_missing():
     points, residual, _ = plate(np.random.default_rng(3), 0.015)
     neighbours, _ = k_nearest(points, 17)
-    up, down = (damaged(r, neighbours, 0.004, MaskSettings()) for r in (residual, -residual))
+    up, down = (flagged(r, neighbours, 0.004) for r in (residual, -residual))
     assert np.array_equal(up, down)
 
 
