@@ -44,7 +44,7 @@ bench-registration: setup  ## registration alone: accuracy, damage found, certai
 
 bench-sections: setup  ## sections alone: the thesis' grid by both methods, sigmas, airfoils, time
 	$(BIN)/python -m benchmarks.sections
-	$(BIN)/python -m benchmarks.thesis_sections
+	$(BIN)/python -m benchmarks.section_grid
 
 bench-twin: setup  ## twin and repair alone: section 5.5, six kinds of wear, volumes, peers
 	$(BIN)/python -m benchmarks.twin
