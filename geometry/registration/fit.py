@@ -147,12 +147,16 @@ def fit_kept(
     steps: int = 15,
     close_mm: float = 2e-5,
 ) -> Fit:
-    """The pose by plain least squares over the `kept` points (n,) and what is `held`."""
+    """The pose by plain least squares over the `kept` points (n,) and what is `held`.
+
+    Whether the surface feels a point is decided at the start: a point that changes sides on the way would
+    send the steps to and fro.
+    """
     T, found, weak = start.T_nominal_scan, start.found, start.weak
+    weights = (kept & felt(nominal, found)).astype(np.float64)
     taken, size_mm = 0, np.inf
     while taken < steps and size_mm >= close_mm:
         moved_mm = apply(T, points_mm)
-        weights = (kept & felt(nominal, found)).astype(np.float64)
         step = solve_step(nominal, moved_mm, found, weights, held.rows(T, nominal.pivot_mm))
         twist = step.twist * min(1.0, LONGEST_KEPT_STEP_MM / (step.size_mm + 1e-12))
         T, weak = exp(twist, nominal.pivot_mm) @ T, step.weak

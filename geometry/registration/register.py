@@ -18,7 +18,7 @@ from geometry.robust import robust_sigma
 from geometry.scan.neighbourhood import nearest_of
 from geometry.threads import one_blas_thread
 from geometry.transforms import apply, exp
-from geometry.types import Bools, Cloud, Ints
+from geometry.types import Bools, Cloud, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +80,9 @@ def _settled(
     found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
     fit = replace(start, found=found)
     for _ in range(settings.rounds):
-        damage = _damage_of(cloud, _past_rims_none(fit.found, nominal), neighbours, settings.mask)
+        moved_mm = apply(fit.T_nominal_scan, cloud.points_mm)
+        judged = _past_rims_none(moved_mm, fit.found, nominal, settings.explained_mm)
+        damage = _damage_of(cloud, judged, neighbours, settings.mask)
         sound, clear = ~damage, ~ringed(damage, neighbours, settings.mask)
         held = int((sound & felt(nominal, fit.found)).sum())
         if held < settings.least_points:
@@ -92,9 +94,14 @@ def _settled(
     return held_by_ends(cloud, replace(fit, iterations=turns), sound, resting, nominal)
 
 
-def _past_rims_none(found: Closest, nominal: Nominal) -> Closest:
-    """The same feet, those on a rim without a distance: a scan may slide past its end and is no damage."""
-    return replace(found, distance_mm=np.where(on_rim(nominal, found.points_mm), 0.0, found.distance_mm))
+def _past_rims_none(moved_mm: Floats, found: Closest, nominal: Nominal, aside_mm: float) -> Closest:
+    """The same feet, those on a rim without a distance unless their points (n, 3) lie further aside.
+
+    A scan may slide past its end and is no damage; a fixture beside that end is none of the blade's.
+    """
+    near = np.linalg.norm((moved_mm - found.points_mm)[:, :2], axis=1) <= aside_mm
+    past = near & on_rim(nominal, found.points_mm)
+    return replace(found, distance_mm=np.where(past, 0.0, found.distance_mm))
 
 
 def _elsewhere(

@@ -108,6 +108,19 @@ def test_metal_of_a_fixture_does_not_pull():
     assert alignment.explained_fraction > 0.97
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_fixture_level_with_the_end_of_the_blade_does_not_pull(seed):
+    rng = np.random.default_rng(seed)
+    scan = blades.with_noise(blades.with_form_error(blades.scan(BLADE, 0.6, rng), 0.03), SIGMA_MM, rng)
+    count = len(scan.points_mm) // 2
+    level_mm = np.column_stack([rng.uniform([-30, -20], [30, 20], (count, 2)), np.zeros(count)])
+    level_mm += rng.normal(scale=SIGMA_MM, size=level_mm.shape)
+    both = replace(scan, points_mm=np.concatenate([scan.points_mm, level_mm]))
+    alignment = register(seen_from(both, pose(seed)), nominal())
+    assert alignment.converged
+    assert displacement_mm(alignment.T_nominal_scan, pose(seed))[0] < 0.02
+
+
 def test_the_mask_finds_deep_damage_and_spares_the_rest():
     rng = np.random.default_rng(30)
     scan = blades.with_noise(damaged_scan(rng), SIGMA_MM, rng)
