@@ -113,6 +113,31 @@ def with_outliers(scan: blades.Scan, blade: blades.Blade, rng: np.random.Generat
     return _with(scan, rng.uniform([-40.0, -30.0, -10.0], [40.0, 30.0, 120.0], (count, 3)))
 
 
+def several(scan: blades.Scan, blade: blades.Blade, rng: np.random.Generator) -> blades.Scan:
+    """One of each: what is missing of the blade, what of it is seen, what else is in the scan."""
+    for makers in (
+        (whole, damaged, without_quarter),
+        (whole, one_sided, with_hole),
+        (whole, gripped, with_outliers),
+    ):
+        scan = makers[rng.integers(len(makers))](scan, blade, rng)
+    return scan
+
+
+def with_hole(scan: blades.Scan, blade: blades.Blade, rng: np.random.Generator) -> blades.Scan:
+    """A patch of 3 to 15 mm radius that no view saw."""
+    centre_mm = blade.point(rng.uniform(0.0, 2.0 * np.pi, 1), rng.uniform(20.0, 90.0, 1))[0]
+    apart_mm = np.linalg.norm(scan.points_mm - centre_mm, axis=1)
+    return _chosen(scan, apart_mm > rng.uniform(3.0, 15.0))
+
+
+def gripped(scan: blades.Scan, blade: blades.Blade, rng: np.random.Generator) -> blades.Scan:
+    """The same clamp, its top up to 3 mm below or above the end of the blade."""
+    count = len(scan.points_mm)
+    clamp_mm = cluttered(scan, blade, rng).points_mm[count:]
+    return _with(scan, clamp_mm + np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)]))
+
+
 def _chosen(scan: blades.Scan, kept: np.ndarray) -> blades.Scan:
     return blades.Scan(
         points_mm=scan.points_mm[kept], normals=scan.normals[kept], depth_mm=scan.depth_mm[kept]
@@ -136,6 +161,7 @@ SCENARIOS: dict[str, Maker] = {
     "one side seen": one_sided,
     "clamp in the scan": cluttered,
     "5 % outliers": with_outliers,
+    "several at once": several,
 }
 
 
