@@ -12,7 +12,7 @@ from geometry.damage.local_shape import pieces
 from geometry.damage.skin import skin_of
 from geometry.deformation.twin import Twin
 from geometry.errors import BadInput
-from geometry.kernels.graph import dilate, grow, neighbourhood_mean
+from geometry.kernels.graph import dilate, grow, neighbourhood_mean, neighbourhood_median
 from geometry.registration.alignment import Alignment
 from geometry.scan.neighbourhood import nearest_of
 from geometry.transforms import apply
@@ -28,18 +28,20 @@ class RegionSettings:
     """When points that stand off the twin make a region.
 
     Distances are means over a neighbourhood, in units of their standard deviation: noise of the mean and
-    sigma of the twin. A region begins at `high`, and reaches down to `low`.
+    sigma of the twin. A region begins at `high`, and reaches down to `low`; down to `skirt` where it runs
+    out gently.
     """
 
     neighbours: int = 16
     high: float = 6.0
     low: float = 3.0
+    skirt: float = 2.0
     floor_mm: float = 0.008  # least standard deviation: what the scanner's own errors do not average out
     least_points: int = 12
     join_mm: float = 1.0  # metal nearer than this to other such metal, or to the skin, belongs to it
 
     def __post_init__(self) -> None:
-        if not (self.neighbours >= 4 and 0.0 < self.low <= self.high and self.least_points >= 4):
+        if not (0.0 < self.skirt <= self.low <= self.high and min(self.neighbours, self.least_points) >= 4):
             raise BadInput(f"regions: {self} contradicts itself")
         if not (self.floor_mm > 0.0 and self.join_mm > 0.0):
             raise BadInput(f"regions: {self} contradicts itself")
@@ -128,14 +130,18 @@ def _connected(mean_mm: Floats, own_mm: Floats, field: Field, settings: RegionSe
     """Index sets of the points whose mean stands off by `high` sigmas, with what hangs together above `low`.
 
     Next to a deep break the means reach past its border: sound points among them are given back, and points
-    that the means of their sound neighbours hide are taken in.
+    that the means of their sound neighbours hide are taken in. A shallow hollow runs out gently: there most
+    of a neighbourhood stands off, and noise says no more of a single point.
     """
-    certain = field.on_airfoil & (mean_mm > settings.high * field.sigma_mm)
-    likely = field.on_airfoil & (mean_mm > settings.low * field.sigma_mm)
-    reached = grow(certain, likely, field.neighbours)
+    sigmas = np.where(field.on_airfoil, mean_mm / field.sigma_mm, 0.0)
+    certain, likely = sigmas > settings.high, sigmas > settings.low
+    perhaps = (sigmas > settings.skirt) & ~certain
+    most_mm = neighbourhood_median(own_mm, field.neighbours, perhaps)
+    gentle = perhaps & (most_mm > settings.skirt * field.sigma_mm)
+    reached = grow(certain, likely | gentle, field.neighbours)
     proven = field.on_airfoil & (own_mm > settings.low * np.maximum(field.noise_mm, field.sigma_mm))
     wider = dilate(reached, field.neighbours) & proven
-    chosen = np.flatnonzero(wider | (reached & (own_mm > 0.5 * mean_mm)))
+    chosen = np.flatnonzero(wider | (reached & (gentle | (own_mm > 0.5 * mean_mm))))
     labels = _labels(chosen, field, max(LINK_SPACINGS * field.spacing_mm, settings.join_mm))
     groups = [chosen[labels == label] for label in np.unique(labels)]
     return [group for group in groups if len(group) >= settings.least_points]
