@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtr
 
 from geometry.blade.nominal import UP, Closest, Nominal
 from geometry.robust import robust_sigma
@@ -20,8 +20,8 @@ LEAST = 100  # points in the window
 LIT = 5  # points on a face beyond a rim that make it seen ...
 INWARD_MM = 0.3  # ... so far from it: nearer to it lie feet of a wall that slid past its end, too
 SHARE = 0.05  # of the points that a tip face would have, below which it is not seen
-SHARPEST_MM, BLUNTEST_MM = 5e-4, 0.08  # blur of an end; beyond, it is ragged
-BLURS_MM = (0.002, 0.01, 0.04)  # to start from: the likelihood has a ridge
+BLURS_MM = np.geomspace(5e-4, 0.4, 14)  # of an end ...
+BLUNTEST_MM = 0.08  # ... beyond which it is ragged
 LEVEL_MM = 0.01  # of a rim that is an end at one height
 CHANCE = 4.0  # sigmas within which two ends are as far apart as the nominal's
 
@@ -98,15 +98,45 @@ def scan_ends(moved_mm: Floats, sound: Bools, found: Closest, nominal: Nominal) 
     anywhere, and one edge near a rim may be chance: ends count only together, unseen faces beyond both,
     as far apart as the rims are.
     """
-    ends = [_end(rim, moved_mm, sound, found, nominal) for rim in rims(nominal)]
-    both = tuple(end for end in ends if end is not None)
+    walls = [_wall(rim, moved_mm, sound, found, nominal) for rim in rims(nominal)]
+    both = [wall for wall in walls if wall is not None]
     if len(both) < 2:
         return ()
-    chance_mm = CHANCE * float(np.hypot(both[0].sigma_mm, both[1].sigma_mm))
-    return both if abs(both[0].off_mm - both[1].off_mm) <= chance_mm else ()
+    ends = _stops(both)
+    chance_mm = CHANCE * float(np.hypot(ends[0].sigma_mm, ends[1].sigma_mm))
+    return ends if abs(ends[0].off_mm - ends[1].off_mm) <= chance_mm else ()
 
 
-def _end(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nominal) -> End | None:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Wall:
+    """The wall of a scan next to an end: how far past it (k,) its points lie, and where it may stop.
+
+    `stops_mm` (b,) are the likeliest for each blur of `BLURS_MM`, `misfits` (b,) how unlikely they are.
+    """
+
+    past_mm: Floats
+    middle_mm: Floats  # (3,)
+    height_mm: float
+    outward: float
+    scatter_mm: float
+    stops_mm: Floats
+    misfits: Floats
+
+    def end(self, shares: Floats) -> End:
+        """Its end, if the blurs have these shares (b,)."""
+        stop_mm = float(shares @ self.stops_mm)
+        each_mm = (WINDOW_MM + stop_mm) / len(self.past_mm)
+        blur_mm = max(float(shares @ BLURS_MM), self.scatter_mm)
+        unsure_mm2 = float(shares @ (self.stops_mm - stop_mm) ** 2)
+        return End(
+            point_mm=np.array([*self.middle_mm[:2], self.height_mm + self.outward * stop_mm]),
+            height_mm=self.height_mm,
+            sigma_mm=float(np.sqrt((3.0 * blur_mm + 2.0 * each_mm) * each_mm + unsure_mm2)),
+        )
+
+
+def _wall(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nominal) -> _Wall | None:
+    """The wall next to a rim, if it stops there sharply and no face beyond is seen."""
     if rim.high_mm - rim.low_mm > LEVEL_MM:
         return None
     height_mm = 0.5 * (rim.low_mm + rim.high_mm)
@@ -119,15 +149,27 @@ def _end(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nomi
         wall = wall[apart_mm > CLEAR_MM]
     if len(wall) < LEAST or _seen(wall, found, nominal) >= LIT:
         return None
-    stop_mm, blur_mm = _step(past_mm[wall])
-    if not blur_mm < BLUNTEST_MM:
+    stops_mm, misfits = _likeliest(past_mm[wall])
+    if not BLURS_MM[np.argmin(misfits)] < BLUNTEST_MM:
         return None
-    each_mm = (WINDOW_MM + stop_mm) / len(wall)
-    blur_mm = max(blur_mm, robust_sigma(found.distance_mm[wall]))
-    sigma_mm = float(np.sqrt((3.0 * blur_mm + 2.0 * each_mm) * each_mm))
-    middle_mm = moved_mm[wall].mean(axis=0)
-    point_mm = np.array([middle_mm[0], middle_mm[1], height_mm + outward * stop_mm])
-    return End(point_mm=point_mm, height_mm=height_mm, sigma_mm=sigma_mm)
+    return _Wall(
+        past_mm=past_mm[wall],
+        middle_mm=moved_mm[wall].mean(axis=0),
+        height_mm=height_mm,
+        outward=outward,
+        scatter_mm=robust_sigma(found.distance_mm[wall]),
+        stops_mm=stops_mm,
+        misfits=misfits,
+    )
+
+
+def _stops(walls: list[_Wall]) -> tuple[End, ...]:
+    """Where walls stop. One scanner blurs them alike, and each blur counts by how likely it makes all: the
+    likeliest one alone would go to and fro between two as soon as the scan moves.
+    """
+    misfits = np.sum([wall.misfits for wall in walls], axis=0)
+    shares = np.exp(misfits.min() - misfits)
+    return tuple(wall.end(shares / shares.sum()) for wall in walls)
 
 
 def without_strays(sound: Bools, clear: Bools, found: Closest, nominal: Nominal) -> Bools:
@@ -147,23 +189,21 @@ def _seen(near: Ints, found: Closest, nominal: Nominal) -> int:
     return int(np.count_nonzero(~on_rim(nominal, feet_mm[lid], INWARD_MM)))
 
 
-def _step(past_mm: Floats) -> tuple[float, float]:
-    """Where points (n,), even up to there and blurred by normal noise, stop; and the blur: likeliest both."""
-    count = len(past_mm)
+def _likeliest(past_mm: Floats) -> tuple[Floats, Floats]:
+    """Where points (n,), even up to there and blurred by normal noise, stop: the likeliest place for each
+    blur (b,), and its misfit: minus the logarithm of how likely."""
+    count, farthest_mm = len(past_mm), 0.8 * WINDOW_MM
 
-    def misfit(guess: Floats) -> float:
-        stop_mm, blur_mm = float(guess[0]), float(np.exp(guess[1]))
-        if not (abs(stop_mm) < 0.8 * WINDOW_MM and SHARPEST_MM <= blur_mm <= WINDOW_MM):
-            return np.inf
-        return count * float(np.log(WINDOW_MM + stop_mm)) - float(
-            log_ndtr((stop_mm - past_mm) / blur_mm).sum()
-        )
+    def misfit(stop_mm: float, blur_mm: float) -> float:
+        inside = log_ndtr((stop_mm - past_mm) / blur_mm).sum()
+        to, of = _ramp((stop_mm + WINDOW_MM) / blur_mm), _ramp((stop_mm - WINDOW_MM) / blur_mm)
+        return count * float(np.log(blur_mm * (to - of))) - float(inside)
 
-    start_mm = min(float(np.quantile(past_mm, 0.99)), 0.5)
-    limits = {"xatol": 1e-5, "fatol": 1e-4, "maxiter": 200}
-    tries = [
-        minimize(misfit, np.array([start_mm, np.log(blur_mm)]), method="Nelder-Mead", options=limits)
-        for blur_mm in BLURS_MM
-    ]
-    best = min(tries, key=lambda one: float(one.fun))
-    return float(best.x[0]), float(np.exp(best.x[1]))
+    limits, precise = (-farthest_mm, farthest_mm), {"xatol": 1e-5}
+    best = [minimize_scalar(misfit, args=(blur,), bounds=limits, options=precise) for blur in BLURS_MM]
+    return np.array([one.x for one in best]), np.array([one.fun for one in best])
+
+
+def _ramp(u: float) -> float:
+    """The integral of the normal distribution up to u."""
+    return float(u * ndtr(u) + np.exp(-0.5 * u * u) / np.sqrt(2.0 * np.pi))
