@@ -78,7 +78,8 @@ def test_ends_are_as_certain_as_they_say():
 def test_an_end_is_told_in_one_place_wherever_the_scan_lies():
     points_mm = open_scan(48, 1.5)
     slides_mm = np.array([-0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03])
-    told_mm = [[end.off_mm for end in ends_of(points_mm + [0.0, 0.0, slide])] for slide in slides_mm]
+    along = np.array([0.0, 0.0, 1.0])
+    told_mm = [[end.off_mm for end in ends_of(points_mm + slide * along)] for slide in slides_mm]
     assert np.ptp(np.array(told_mm) - slides_mm[:, None], axis=0).max() < 0.002  # two apart: 0.014
 
 
