@@ -109,12 +109,11 @@ def scan_ends(moved_mm: Floats, sound: Bools, found: Closest, nominal: Nominal) 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Wall:
-    """The wall of a scan next to an end: how far past it (k,) its points lie, and where it may stop.
-
-    `stops_mm` (b,) are the likeliest for each blur of `BLURS_MM`, `misfits` (b,) how unlikely they are.
+    """The wall of a scan next to an end, and where it may stop: `stops_mm` (b,) are the likeliest places for
+    each blur of `BLURS_MM`, `misfits` (b,) how unlikely they are.
     """
 
-    past_mm: Floats
+    points: int
     middle_mm: Floats  # (3,)
     height_mm: float
     outward: float
@@ -125,7 +124,7 @@ class _Wall:
     def end(self, shares: Floats) -> End:
         """Its end, if the blurs have these shares (b,)."""
         stop_mm = float(shares @ self.stops_mm)
-        each_mm = (WINDOW_MM + stop_mm) / len(self.past_mm)
+        each_mm = (WINDOW_MM + stop_mm) / self.points
         blur_mm = max(float(shares @ BLURS_MM), self.scatter_mm)
         unsure_mm2 = float(shares @ (self.stops_mm - stop_mm) ** 2)
         return End(
@@ -153,7 +152,7 @@ def _wall(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nom
     if not BLURS_MM[np.argmin(misfits)] < BLUNTEST_MM:
         return None
     return _Wall(
-        past_mm=past_mm[wall],
+        points=len(wall),
         middle_mm=moved_mm[wall].mean(axis=0),
         height_mm=height_mm,
         outward=outward,
