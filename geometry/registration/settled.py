@@ -14,7 +14,7 @@ from geometry.types import Bools, Cloud, Floats
 ENDS_MM = 0.01  # standard uncertainty of the surface along a motion beyond which ends of the scan are asked
 LOOKS = 4  # at the ends: how far they reach is told best by points evenly around them
 CLOSE_MM = 0.03  # that a look at the ends moves them, from where on another would see the same
-LEAST_WEIGHT = 1e-3  # of an end beside all points: enough that no step leaves it out
+LEAST_WEIGHT = 1e-3  # of the lighter end beside all points: enough that no step leaves it out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,12 +76,13 @@ def _held(ends: tuple[End, ...], fit: Fit, settled: Settled, nominal: Nominal) -
     """The ends seen at `fit`, weighted as points are: by the variance that these show along the open one."""
     open_ = settled.certainty.twists[:, -1]
     a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
+    weights = a_point_mm2 / np.array([end.sigma_mm for end in ends]) ** 2
     least = LEAST_WEIGHT * len(settled.kept)
     back = inverse(fit.T_nominal_scan)
     return Held(
         points_mm=apply(back, np.array([end.point_mm for end in ends])),
         heights_mm=np.array([end.height_mm for end in ends]),
-        weights=np.array([max(a_point_mm2 / end.sigma_mm**2, least) for end in ends]),
+        weights=weights * max(1.0, least / float(weights.min())),
     )
 
 

@@ -159,6 +159,16 @@ def test_ends_hold_a_scan_where_they_are_however_far_it_slid():
         assert there.converged
 
 
+def test_of_two_ends_that_are_apart_the_surer_one_holds_more():
+    points_mm = open_scan(38, 6.0)
+    points_mm = points_mm[points_mm[:, 2] < 104.95]
+    top = np.flatnonzero(points_mm[:, 2] > 103.0)
+    points_mm = np.delete(points_mm, top[np.arange(len(top)) % 4 > 0], axis=0)
+    bottom, tip = ends_of(apply(slid(points_mm, 0.0).T_nominal_scan, points_mm))
+    assert bottom.sigma_mm < 0.8 * tip.sigma_mm
+    assert -bottom.off_mm / tip.off_mm == pytest.approx((bottom.sigma_mm / tip.sigma_mm) ** 2, rel=0.1)
+
+
 def test_ends_that_still_move_the_scan_have_not_converged(monkeypatch):
     monkeypatch.setattr("geometry.registration.settled.LOOKS", 1)
     points_mm = open_scan(37)
