@@ -8,8 +8,8 @@ and 98 mm. Noise is N(0, sigma) along a random direction, so sigma / sqrt(3) alo
 thesis. Both methods get the same points, of which the thesis' takes a slab next to the section and the
 product's a band of neighbouring heights. Figures are the largest of all draws and sections.
 
-The last tables set them against what noise allows: for the product the bound of Cramer and Rao of its band,
-for the thesis' what noise alone does to a slab whose form is known. No method that sees one slab only can
+The last tables set them against what noise allows, the bound of Cramer and Rao: for the product that of its
+band, for the thesis' that of the slab. No method that sees one slab only can
 be better: where the thesis' own figure is, its points were other than its words say. Points fall at random
 here, so that edges are left bare for a millimetre, where an even sampling leaves none. The thesis used
 36.35 s a section (table 4.2).
@@ -114,7 +114,7 @@ def product(part: Part, chart: Chart, points_mm: Floats, noise_mm: float, spacin
     cpu_s = time.process_time() - start_s
     low_mm, high_mm = band_of(chart, points_mm[:, 2], SETTINGS)
     per_mm = (high_mm - low_mm) / spacing_mm**2
-    least = bounds(chart.curve_mm, noise_mm / np.sqrt(3.0), per_mm)
+    least = least_sigmas(chart.curve_mm, chart.curve_mm, noise_mm / np.sqrt(3.0), per_mm)
     return judged(part, chart, curve_mm, curve_mm, least, cpu_s)
 
 
@@ -127,7 +127,8 @@ def faithful(part: Part, chart: Chart, points_mm: Floats, noise_mm: float) -> Fo
     curve_mm = profile.curve_mm(np.arange(4096) / 4096)
     cpu_s = time.process_time() - start_s
     nodes_mm = trace(profile, near_mm, chart).curve_mm
-    least = noise_alone(nodes_mm, chart.curve_mm, sigma_mm, len(profile.thinned.points_mm))
+    per_mm = len(profile.thinned.points_mm) / node_shares(nodes_mm).sum()
+    least = least_sigmas(nodes_mm, chart.curve_mm, sigma_mm, per_mm)
     return judged(part, chart, curve_mm, nodes_mm, least, cpu_s)
 
 
@@ -187,26 +188,16 @@ def distance_to(curve: Floats, points: Floats) -> Floats:
     return best
 
 
-def bounds(curve: Floats, noise: float, per_mm: float) -> tuple[float, float]:
-    """The least standard deviations of centroid (mm) and orientation (deg) that noise `noise` along the
-    normal allows.
+def least_sigmas(curve: Floats, nominal: Floats, sigma: float, per_mm: float) -> tuple[float, float]:
+    """The least standard deviations of centroid (mm, both axes) and orientation (deg) that noise `sigma`
+    along the normal allows, with `per_mm` points on each mm of arc.
 
-    `per_mm` points on each mm of arc, all heights of the band together: the Cramer-Rao bound of a section
-    whose form is unknown and the same all over the band. One that moves along a line has it too.
+    The Cramer-Rao bound of a section whose form is the same at all heights that the points come from. One
+    that moves along a line has it too.
     """
-    growths = np.vstack([centroid_gradient(curve), np.rad2deg(orientation(curve, curve).gradient)])
-    x, y, turn = noise**2 / per_mm * (growths**2 / node_shares(curve)).sum(axis=1)
+    growths = np.vstack([centroid_gradient(curve), np.rad2deg(orientation(curve, nominal).gradient)])
+    x, y, turn = sigma**2 / per_mm * (growths**2 / node_shares(curve)).sum(axis=1)
     return float(np.sqrt(x + y)), float(np.sqrt(turn))
-
-
-def noise_alone(curve: Floats, nominal: Floats, sigma: float, points: int) -> tuple[float, float]:
-    """Standard deviation of centroid (mm, both axes) and orientation (deg) from `points` on a known form."""
-    share = node_shares(curve)
-    each = share.sum() / points
-    x, y = centroid_gradient(curve)
-    turn = orientation(curve, nominal).gradient
-    variances = [float((g**2 / share).sum()) * each * sigma**2 for g in (x, y, turn)]
-    return float(np.sqrt(variances[0] + variances[1])), float(np.rad2deg(np.sqrt(variances[2])))
 
 
 def table(kind: int, title: str, thesis: tuple[tuple[float, ...], ...], theirs: Cells, ours: Cells) -> None:

@@ -73,7 +73,8 @@ def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
 
 
 def _held(ends: tuple[End, ...], fit: Fit, settled: Settled, nominal: Nominal) -> Held:
-    """The ends seen at `fit`, weighted as points are: by the variance that these show along the open one."""
+    """The ends seen at `fit`, weighted as points are, by the variance that these show along the open motion;
+    where that is next to nothing, both as much more as the lighter needs to count."""
     open_ = settled.certainty.twists[:, -1]
     a_point_mm2 = float(settled.certainty.sigma_mm[-1] ** 2 * (open_ @ settled.normal_matrix @ open_))
     weights = a_point_mm2 / np.array([end.sigma_mm for end in ends]) ** 2
