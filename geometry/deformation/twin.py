@@ -10,7 +10,16 @@ from geometry.deformation.ground import Ground, prepare_ground
 from geometry.deformation.kriging import Sample, Wear, fit_wear, likeliest_prior, sample_of, typical_prior
 from geometry.deformation.moved_mesh import at_nodes, at_vertices, form_deviation
 from geometry.deformation.offset import Offset, fit_offset
-from geometry.deformation.votes import NO_NOISE_MM, Found, binned, compare, gather, ripple_mm, screen
+from geometry.deformation.votes import (
+    NO_NOISE_MM,
+    Found,
+    binned,
+    compare,
+    gather,
+    ripple_mm,
+    screen,
+    skin_at_rims,
+)
 from geometry.errors import CannotFitTwin
 from geometry.kernels.neighbours import near_each_other
 from geometry.registration.alignment import Alignment
@@ -87,7 +96,8 @@ def fit_twin(
     rough, rounds, converged = _fit_rounds(scan_mm, mask, ground, settings, rng)
     found = compare(scan_mm, rough.freeform, ground)
     near_damage = screen(found, ground, settings.damage_mm, 0)  # what is there tells most of what is lost
-    sample = _sample(found, near_damage, rough, settings.damage_mm, settings.damage_mm, ground)
+    skin = skin_at_rims(scan_mm, near_damage, found, ground.nodes, settings.damage_mm)
+    sample = _sample(found, skin, rough, settings.damage_mm, settings.damage_mm, ground)
     prior = likeliest_prior(sample, rough.prior, ground.lattice, settings.places)
     wear = fit_wear(sample, prior, ground.lattice)
     change = wear.freeform.since(rough.freeform)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Closest
 from geometry.deformation.freeform import Freeform
@@ -14,6 +15,8 @@ from geometry.robust import spread
 from geometry.types import Bools, Floats, Ints
 
 NO_NOISE_MM = 1e-5  # least scatter believed
+FLATTEST = 6.0  # a break runs along the skin for at most so many times its depth
+WITHIN, FLAT = 2.0, 0.1  # so many times the scatter, or so much of `damage_mm`, is as flat as skin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,3 +165,23 @@ def screen(found: Found, ground: Ground, damage_mm: float, rings: int) -> Bools:
     apart_mm = np.abs(found.along_mm - median_mm[found.owner])
     single_mm = max(damage_mm, 5.0 * spread(apart_mm[chosen]))
     return np.asarray(chosen & ~out[found.owner] & (apart_mm <= single_mm))
+
+
+def skin_at_rims(points_mm: Floats, sound: Bools, found: Found, nodes: Nodes, damage_mm: float) -> Bools:
+    """The sound points (n,) without those that a break may have left on the rim of what is not sound.
+
+    A break's own points pass for skin while they lie less than `damage_mm` deep; that is as wide as a break
+    takes to get so deep, and as far as to the first point that does. There only points well within the
+    scatter about their node count.
+    """
+    if sound.all() or not sound.any():
+        return sound
+    spacing_mm = np.sqrt(nodes.area_mm2[np.unique(found.owner[sound])].sum() / sound.sum())
+    rim_mm = spacing_mm + FLATTEST * damage_mm
+    to_off_mm, _ = cKDTree(points_mm[~sound]).query(points_mm[sound], distance_upper_bound=rim_mm)
+    owner, along_mm = found.owner[sound], found.along_mm[sound]
+    median_mm, _ = group_medians(owner, along_mm, len(nodes.points_mm))
+    apart_mm = np.abs(along_mm - median_mm[owner])
+    skin = sound.copy()
+    skin[sound] = np.isinf(to_off_mm) | (apart_mm <= max(WITHIN * spread(apart_mm), FLAT * damage_mm))
+    return skin

@@ -3,6 +3,7 @@
 `places` (n, 3) lie in axes of which the last runs along the span; `swell` (n,) is how much of the swelling a
 place feels. `prior` holds, in this order, the standard deviations of the shift and of the swelling, their
 correlation lengths along the span and in the section, and the standard deviation and length of the ripple.
+Wear runs round a section much alike all along the span: its correlation is a product of both.
 
 Inner loops run along columns, without branches: compilers make vectors of them.
 """
@@ -32,10 +33,11 @@ def _place(table, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _smooth(r2):  # type: ignore[no-untyped-def]
-    """Matern correlation of smoothness 5/2 at the squared distance in lengths."""
-    a = np.sqrt(5.0 * r2)
-    return (1.0 + a + a * a / 3.0) * decay(a)
+def _alike(along_r2, across_r2):  # type: ignore[no-untyped-def]
+    """Matern correlations of smoothness 5/2 at squared distances in lengths, along the span times in the
+    section."""
+    a, b = np.sqrt(5.0 * along_r2), np.sqrt(5.0 * across_r2)
+    return (1.0 + a + a * a / 3.0) * (1.0 + b + b * b / 3.0) * decay(a + b)
 
 
 @njit(cache=True, nogil=True, fastmath=SUMS)
@@ -73,7 +75,7 @@ def covariance(
         x, y, z, nx, ny, nz, swells = _place(here, i)
         for j in range(len(others)):
             across, along, _, together, aligned = _between(x, y, z, nx, ny, nz, there, j)
-            alike = _smooth(along * per_span2 + across * per_section2)
+            alike = _alike(along * per_span2, across * per_section2)
             value = (moved2 + shift2 * alike) * together + leaned2 * aligned
             result[i, j] = value + swelling2 * alike * swells * there[6, j]
     return result
@@ -94,7 +96,7 @@ def joint_covariance(
         x, y, z, nx, ny, nz, swells = _place(table, i)
         for j in range(i, len(places)):
             across, along, turned, together, aligned = _between(x, y, z, nx, ny, nz, table, j)
-            alike = _smooth(along * per_span2 + across * per_section2)
+            alike = _alike(along * per_span2, across * per_section2)
             b = np.sqrt((across + along) * per_ripple2)
             value = (moved2 + shift2 * alike) * together + leaned2 * aligned
             value += swelling2 * alike * swells * table[6, j]
@@ -121,19 +123,19 @@ def covariance_slopes(
         for j in range(i + 1, len(places)):
             across, along, turned, together, _ = _between(x, y, z, nx, ny, nz, table, j)
             along_r2, across_r2 = along * per_span2, across * per_section2
-            a = np.sqrt(5.0 * (along_r2 + across_r2))
-            falling = weights[i, j] * decay(a)
-            alike = (1.0 + a + a * a / 3.0) * falling
-            shift, swelling = shift2 * together, swelling2 * swells * table[6, j]
-            falls = (shift + swelling) * (5.0 / 3.0) * (1.0 + a) * falling
-            b = np.sqrt((across + along) * per_ripple2)
-            ripple = weights[i, j] * ripple2 * decay(b + turned * per_turn2)
-            shifts += 2.0 * shift * alike
-            swellings += 2.0 * swelling * alike
-            spans += falls * along_r2
-            sections += falls * across_r2
-            ripples += 2.0 * ripple * (1.0 + b)
-            lengths += ripple * b * b
+            a, b = np.sqrt(5.0 * along_r2), np.sqrt(5.0 * across_r2)
+            alike_along, alike_across = 1.0 + a + a * a / 3.0, 1.0 + b + b * b / 3.0
+            falling = weights[i, j] * decay(a + b)
+            shift, swelling = shift2 * together * falling, swelling2 * swells * table[6, j] * falling
+            falls = (shift + swelling) * (5.0 / 3.0)
+            shifts += 2.0 * shift * alike_along * alike_across
+            swellings += 2.0 * swelling * alike_along * alike_across
+            spans += falls * along_r2 * (1.0 + a) * alike_across
+            sections += falls * across_r2 * (1.0 + b) * alike_along
+            c = np.sqrt((across + along) * per_ripple2)
+            ripple = weights[i, j] * ripple2 * decay(c + turned * per_turn2)
+            ripples += 2.0 * ripple * (1.0 + c)
+            lengths += ripple * c * c
     return 2.0 * np.array([shifts, swellings, spans, sections, ripples, lengths])
 
 
@@ -148,7 +150,7 @@ def carried(places: Floats, others: Floats, prior: Floats, sources: Floats) -> F
         x, y, z = here[i]
         a, b, c, d = 0.0, 0.0, 0.0, 0.0
         for j in range(len(others)):
-            alike = _smooth((x - there[0, j]) ** 2 + (y - there[1, j]) ** 2 + (z - there[2, j]) ** 2)
+            alike = _alike((z - there[2, j]) ** 2, (x - there[0, j]) ** 2 + (y - there[1, j]) ** 2)
             a += alike * columns[0, j]
             b += alike * columns[1, j]
             c += alike * columns[2, j]

@@ -78,11 +78,15 @@ def test_the_lattice_follows_a_cubic_exactly() -> None:
 PRIOR = np.array([0.05, 0.02, 30.0, 12.0, 0.004, 2.5])
 
 
+def matern(r: Floats) -> Floats:
+    a = np.sqrt(5.0) * r
+    return np.asarray((1.0 + a + a**2 / 3.0) * np.exp(-a))
+
+
 def slow_covariance(sample: Sample, others: Sample, prior: Floats) -> tuple[Floats, Floats]:
     """Covariance of wear, and that of ripple."""
     off = sample.places_mm[:, None] - others.places_mm
-    r = np.linalg.norm(off / prior[[3, 3, 2]], axis=2) * np.sqrt(5.0)
-    alike = (1.0 + r + r**2 / 3.0) * np.exp(-r)
+    alike = matern(np.abs(off[..., 2]) / prior[2]) * matern(np.linalg.norm(off[..., :2], axis=2) / prior[3])
     together = sample.normals @ others.normals.T
     wear = (AFFINE[0] ** 2 + prior[0] ** 2 * alike) * together
     in_section = sample.normals[:, :2] @ others.normals[:, :2].T
