@@ -36,7 +36,7 @@ _PILOT_BINS = (2, 4)  # ... in each knot span along the arc, and across
 _BINS = (4, 4)  # the same for all points
 _NEXT_MM, _NEXT_POINTS = 0.4, 5  # along the arc and the span, of points that lie next to a node; at least
 _MEDIAN = 1.2533  # standard error of a median over that of a mean
-_LIKELIER = 9.0  # twice the gain in log likelihood
+_LIKELIER = 9.0, 9.0, 0.0  # x, y, turn: twice the gain in log likelihood that makes a motion curve
 _ARM_MM = 10.0  # a turn counts as the movement of a point so far from the centroid
 
 
@@ -247,7 +247,8 @@ def _steadied(fit: SplineFit, knots: Knots, nominal_mm: Floats) -> SplineFit:
 
     Centroid and turn are sums over the whole arc; left as free to curve as the form beside them, they would
     be no better than a few mm of height make them. Their second differences along z are taken for
-    draws of one variance each, which maximum likelihood gives.
+    draws of one variance each, which maximum likelihood gives; a centroid, which hardly leaves a line but
+    has little area to be told by, curves only where that is three standard deviations' worth.
     """
     bend = np.diff(np.eye(knots.q), 2, axis=0)
     along = knots.along(_motion_gradients(nominal_mm))
@@ -255,7 +256,10 @@ def _steadied(fit: SplineFit, knots: Knots, nominal_mm: Floats) -> SplineFit:
     curved = np.einsum("pq,pqn->n", fit.coefficients, weights)
     covariance = fit.covariance(weights, np.zeros((0, len(curved))))
     blocks = np.arange(len(curved)).reshape(3, -1)
-    variance = [_excess(curved[block], covariance[np.ix_(block, block)]) for block in blocks]
+    variance = [
+        _excess(curved[block], covariance[np.ix_(block, block)], likelier)
+        for block, likelier in zip(blocks, _LIKELIER, strict=True)
+    ]
     return fit.held(weights, np.repeat(variance, blocks.shape[1]))
 
 
@@ -267,10 +271,10 @@ def _motion_gradients(nominal_mm: Floats) -> Floats:
     return np.vstack([centroid_gradient(nominal_mm), _ARM_MM * lever / float(lever @ weighted)])
 
 
-def _excess(values: Floats, covariance: Floats) -> float:
+def _excess(values: Floats, covariance: Floats, likelier: float) -> float:
     """The variance of independent draws that, seen with a `covariance`, most likely give the values.
 
-    None, unless it makes the values much likelier than noise alone does: three standard deviations' worth.
+    None, unless twice the log likelihood is by `likelier` above that of noise alone.
     """
     noise, axes = np.linalg.eigh(covariance)
     noise = np.maximum(noise, 1e-9 * noise[-1])
@@ -279,4 +283,4 @@ def _excess(values: Floats, covariance: Floats) -> float:
     total = noise + tried[:, None]
     cost = np.log(total).sum(axis=1) + (square / total).sum(axis=1)
     best = int(np.argmin(cost))
-    return float(tried[best if cost[best] < cost[0] - _LIKELIER else 0])
+    return float(tried[best if cost[best] < cost[0] - likelier else 0])
