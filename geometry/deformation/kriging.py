@@ -18,7 +18,7 @@ from geometry.errors import CannotFitTwin
 from geometry.kernels.covariance import carried, covariance, covariance_slopes, joint_covariance
 from geometry.types import Floats, Ints
 
-AFFINE = np.array([1.0, 0.005])  # mm, mm/mm: so much the airfoil may move as a whole, and lean
+AFFINE = np.array([0.3, 0.005])  # mm, mm/mm: so much the pose may be off where little holds it, and lean
 VAGUE = np.array([3.0, 3.0, 2.0, 2.0, 3.0, 1.0])  # standard deviations of the logarithms before the data
 TYPICAL_MM = (0.05, 0.05, 0.003)  # shift, swelling, ripple
 SECTION_SHARE = 0.45  # of the section's extent: over so much wear is alike
