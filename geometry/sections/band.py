@@ -247,8 +247,8 @@ def _steadied(fit: SplineFit, knots: Knots, nominal_mm: Floats) -> SplineFit:
 
     Centroid and turn are sums over the whole arc; left as free to curve as the form beside them, they would
     be no better than a few mm of height make them. Their second differences along z are taken for
-    draws of one variance each, which maximum likelihood gives; a centroid, which hardly leaves a line but
-    has little area to be told by, curves only where that is three standard deviations' worth.
+    draws of one variance each, which maximum likelihood gives; a centroid, which noise bends more readily
+    than wear does, curves only where that is three standard deviations' worth.
     """
     bend = np.diff(np.eye(knots.q), 2, axis=0)
     along = knots.along(_motion_gradients(nominal_mm))
