@@ -1,12 +1,15 @@
 """Points and meshes as the bytes of a file. Deterministic: the same arrays give the same bytes."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.types import Floats, Ints, Mesh
 
 CLOUD = np.dtype([("points_mm", "<f8", 3), ("deviation_mm", "<f4")])
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+Corners = NDArray[np.float32]
 
 
 def ply_cloud(points_mm: Floats, deviation_mm: Floats) -> bytes:
@@ -40,23 +43,34 @@ def ply_header(*lines: str) -> bytes:
 
 
 def stl(meshes: list[Mesh]) -> bytes:
-    """Binary STL of closed meshes, mm, each still closed after its corners are rounded to float32.
-
-    Raises `ValueError` when rounding folds a mesh so that an edge no longer joins two facets."""
+    """Binary STL of closed meshes, mm, in float32. Raises `ValueError` when one is not closed."""
     corners = np.concatenate([np.empty((0, 3, 3), np.float32), *(rounded_corners(mesh) for mesh in meshes)])
     table = np.zeros(len(corners), FACET)
     table["corners"], table["normal"] = corners, facet_normals(corners)
     return b"bladecell mm".ljust(80, b" ") + np.uint32(len(corners)).tobytes() + table.tobytes()
 
 
-def rounded_corners(mesh: Mesh) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """Corners (m, 3, 3) of the facets that are still triangles in float32."""
-    rounded, vertex = np.unique(mesh.vertices_mm.astype(np.float32), axis=0, return_inverse=True)
-    faces = vertex.reshape(-1)[mesh.faces]
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    if not is_closed(faces):
-        raise ValueError("the mesh does not stay closed in float32")
-    return rounded[faces]
+def rounded_corners(mesh: Mesh) -> Corners:
+    """Corners (m, 3, 3) of the facets, which join in float32 just as they do in double."""
+    if not is_closed(mesh.faces):
+        raise ValueError("the mesh is not closed")
+    corners: Corners = set_apart(mesh.vertices_mm.astype(np.float32))[mesh.faces]
+    return corners
+
+
+def set_apart(vertices_mm: Corners) -> Corners:
+    """The vertices (n, 3), each of those that lie where another does a step of float32 or a few aside.
+
+    Readers tell corners by their place: vertices that rounding brings together could fold a mesh so that
+    four facets meet in an edge.
+    """
+    apart_mm = vertices_mm.copy()
+    while True:
+        _, first, place = np.unique(apart_mm, axis=0, return_index=True, return_inverse=True)
+        again = first[place.reshape(-1)] != np.arange(len(apart_mm))
+        if not again.any():
+            return apart_mm
+        apart_mm[again, 0] = np.nextafter(apart_mm[again, 0], np.float32(np.inf))
 
 
 def is_closed(faces: Ints) -> bool:
@@ -68,7 +82,7 @@ def is_closed(faces: Ints) -> bool:
     return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
 
 
-def facet_normals(corners: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> Floats:
+def facet_normals(corners: Corners) -> Floats:
     """Unit normals (m, 3); zero for a facet without area, as the format has it."""
     exact = corners.astype(np.float64)
     normals = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])

@@ -20,7 +20,7 @@ from station.formats.pcd import pcd_points
 from station.formats.ply import ply_points
 from station.formats.text import text_points
 from station.formats.threemf import threemf
-from station.formats.write import ply_cloud, ply_mesh, stl
+from station.formats.write import ply_cloud, ply_mesh, set_apart, stl
 from tests.station.parts import tetrahedron
 
 POINTS = np.array([[1.5, -2.25, 3.0], [0.1, 0.2, 0.3], [-7.0, 8.0, 9.125]])
@@ -382,24 +382,35 @@ def test_stl_is_closed_for_others() -> None:
 
 
 def folded(gap_mm: float) -> Mesh:
-    """A closed mesh with an edge of length `gap_mm` far from the origin."""
-    mesh = trimesh.creation.box(extents=(1.0, 1.0, 1.0)).subdivide()
-    vertices: Floats = np.array(mesh.vertices) + 100.0
-    faces = np.array(mesh.faces, np.int64)
-    a, b = faces[0, 0], faces[0, 1]
-    vertices[b] = vertices[a] + [gap_mm, 0.0, 0.0]
-    return Mesh(vertices_mm=vertices, faces=faces)
+    """A double pyramid far from the origin on a triangle of which one side is `gap_mm` long: with that side
+    gone, each pyramid is two facets back to back."""
+    ring = [[0.0, 0.0, 0.0], [gap_mm, 0.0, 0.0], [0.5, 1.0, 0.0]]
+    vertices: Floats = np.array([*ring, [0.5, 0.5, 1.0], [0.5, 0.5, -1.0]]) + 100.0
+    faces = [[a, b, 3] for a, b in ((0, 1), (1, 2), (2, 0))] + [
+        [b, a, 4] for a, b in ((0, 1), (1, 2), (2, 0))
+    ]
+    return Mesh(vertices_mm=vertices, faces=np.array(faces, np.int64))
 
 
-def test_an_edge_too_short_for_float32_collapses_and_the_mesh_stays_closed() -> None:
-    content = stl([folded(1e-9)])
+@pytest.mark.parametrize("gap_mm", [1e-9, 0.0])
+def test_an_edge_too_short_for_float32_does_not_fold_the_mesh(gap_mm: float) -> None:
+    content = stl([folded(gap_mm)])
+    assert len(content) == 84 + 50 * 6
     again = trimesh.load_mesh(io.BytesIO(content), file_type="stl")
     assert again.is_watertight
+    assert len(again.vertices) == 5
 
 
-def test_a_mesh_that_would_open_is_refused() -> None:
+def test_many_corners_in_one_place_are_all_set_apart() -> None:
+    vertices_mm = np.full((50, 3), 100.0, np.float32)
+    apart = set_apart(vertices_mm)
+    assert len(np.unique(apart, axis=0)) == 50
+    assert np.abs(apart - vertices_mm).max() < 50 * 1e-5
+
+
+def test_an_open_mesh_is_refused() -> None:
     mesh = tetrahedron()
-    with pytest.raises(ValueError, match="does not stay closed"):
+    with pytest.raises(ValueError, match="not closed"):
         stl([Mesh(vertices_mm=mesh.vertices_mm, faces=mesh.faces[:3])])
 
 
