@@ -24,6 +24,7 @@ from geometry.registration.fit import (
 from geometry.registration.register import RegisterSettings, mask_damage
 from geometry.registration.uncertainty import certainty, form_covariance
 from geometry.robust import TUKEY, robust_sigma
+from geometry.scan.neighbourhood import nearest_of, surface_shares
 from geometry.threads import one_blas_thread
 from geometry.transforms import apply, exp, inverse, log
 from geometry.types import Bools, Cloud, Floats, Measurand, Unit
@@ -107,13 +108,14 @@ def _register_bands(
     few_mm = cloud.points_mm[chosen[every(len(chosen), settings.register.robust_points)]]
     robust = fit_robust(few_mm, start.T_nominal_scan, nominal)
     fit = replace(robust, found=nominal.closest(apply(robust.T_nominal_scan, cloud.points_mm)))
-    turns = robust.iterations
+    neighbours = nearest_of(cloud, min(settings.register.mask.neighbours + 1, len(cloud)))
+    shares, turns = surface_shares(cloud.points_mm, neighbours), robust.iterations
     for _ in range(settings.register.rounds):
         here = replace(start, T_nominal_scan=fit.T_nominal_scan)
         sound = ~mask_damage(cloud, here, nominal, settings.register) & felt(nominal, fit.found)
         _check_counts(fit.found.points_mm[sound, 2], bands, settings)
         kept = sound & _inside(fit.found.points_mm[:, 2], bands, 0.0)
-        fit = fit_kept(cloud.points_mm, fit, kept, nominal)
+        fit = fit_kept(cloud.points_mm, fit, kept * shares, nominal)
         turns += fit.iterations
     share = float(kept.sum() / _inside(fit.found.points_mm[:, 2], bands, 0.0).sum())
     return _alignment(cloud, nominal, start, replace(fit, iterations=turns), kept, share, method, settings)

@@ -140,20 +140,20 @@ def tukey(distance_mm: Floats, used: Bools, width: float) -> Floats:
 def fit_kept(
     points_mm: Floats,
     start: Fit,
-    kept: Bools,
+    shares: Floats | Bools,
     nominal: Nominal,
     held: Held = NOTHING_HELD,
     *,
     steps: int = 15,
     close_mm: float = 2e-5,
 ) -> Fit:
-    """The pose by plain least squares over the `kept` points (n,) and what is `held`.
+    """The pose by least squares over the points, each counting for its share (n,), and what is `held`.
 
     Whether the surface feels a point is decided at the start: a point that changes sides on the way would
     send the steps to and fro.
     """
     T, found, weak = start.T_nominal_scan, start.found, start.weak
-    weights = (kept & felt(nominal, found)).astype(np.float64)
+    weights = np.where(felt(nominal, found), shares, 0.0)
     taken, size_mm = 0, np.inf
     while taken < steps and size_mm >= close_mm:
         moved_mm = apply(T, points_mm)

@@ -15,7 +15,7 @@ from geometry.registration.settled import Settled, held_by_ends
 from geometry.registration.size import check_size
 from geometry.registration.slide import LEAST, slides_mm
 from geometry.robust import robust_sigma
-from geometry.scan.neighbourhood import nearest_of
+from geometry.scan.neighbourhood import nearest_of, surface_shares
 from geometry.threads import one_blas_thread
 from geometry.transforms import apply, exp
 from geometry.types import Bools, Cloud, Floats, Ints
@@ -75,8 +75,10 @@ def _settled(
 ) -> Settled:
     """Rounds of mask and least squares on the whole cloud.
 
-    The fit rests on the ring round damage, too: each sound point left out lets form into the pose.
+    The fit rests on the ring round damage, too: each sound point left out lets form into the pose. It is
+    one to the surface, however densely each part of it was seen.
     """
+    shares = surface_shares(cloud.points_mm, neighbours)
     found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
     fit = replace(start, found=found)
     for _ in range(settings.rounds):
@@ -88,10 +90,10 @@ def _settled(
         if held < settings.least_points:
             raise CannotRegister(f"{held} scan points lie on the nominal")
         resting = without_strays(sound, clear, fit.found, nominal)
-        fit = fit_kept(cloud.points_mm, fit, resting, nominal)
+        fit = fit_kept(cloud.points_mm, fit, resting * shares, nominal)
         turns += fit.iterations
     resting = without_strays(sound, clear, fit.found, nominal)
-    return held_by_ends(cloud, replace(fit, iterations=turns), sound, resting, nominal)
+    return held_by_ends(cloud, replace(fit, iterations=turns), sound, resting * shares, nominal)
 
 
 def _past_rims_none(moved_mm: Floats, found: Closest, nominal: Nominal, aside_mm: float) -> Closest:

@@ -23,21 +23,21 @@ class Settled:
 
     fit: Fit
     kept: Bools
-    normal_matrix: Floats  # (6, 6) of the kept points, unweighted
+    normal_matrix: Floats  # (6, 6) of the kept points, each by its share
     information: Floats
     form_covariance: Floats
     certainty: Certainty
 
 
-def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, resting: Bools, nominal: Nominal) -> Settled:
-    """What a least-squares pose on the `resting` points (n,) is worth; where these leave a motion open, and
-    the scan, as far as it is sound (n,), stops sharply at both ends of the nominal, the pose that lays these
-    ends on it, too.
+def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, shares: Floats, nominal: Nominal) -> Settled:
+    """What a least-squares pose on points with these shares (n,) is worth; where they leave a motion open,
+    and the scan, as far as it is sound (n,), stops sharply at both ends of the nominal, the pose that lays
+    these ends on it, too.
 
     An end is told worse the further it is from its place: each pose that ends gave is the next one to look
     from, until one stays. If none does, the fit has not converged.
     """
-    settled = _worth(cloud, fit, resting, nominal)
+    settled = _worth(cloud, fit, shares, nominal)
     if not settled.certainty.sigma_mm[-1] > ENDS_MM:
         return settled
     turns = fit.iterations
@@ -46,7 +46,7 @@ def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, resting: Bools, nominal: 
         if not ends:
             return settled
         held = _held(ends, fit, settled, nominal)
-        fit = fit_kept(cloud.points_mm, fit, resting, nominal, held, steps=30)
+        fit = fit_kept(cloud.points_mm, fit, shares, nominal, held, steps=30)
         turns += fit.iterations
         moved_mm = held.rows(fit.T_nominal_scan, nominal.pivot_mm).off_mm - [end.off_mm for end in ends]
         stays = bool(np.abs(moved_mm).max() < CLOSE_MM)
@@ -56,16 +56,18 @@ def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, resting: Bools, nominal: 
     return _with_ends(settled, fit, held, ends, nominal)
 
 
-def _worth(cloud: Cloud, fit: Fit, sound: Bools, nominal: Nominal) -> Settled:
-    kept = sound & felt(nominal, fit.found)
+def _worth(cloud: Cloud, fit: Fit, shares: Floats, nominal: Nominal) -> Settled:
+    kept = (shares > 0.0) & felt(nominal, fit.found)
+    share = shares[kept]
+    uneven = float(np.mean(share**2) / np.mean(share) ** 2) if kept.any() else 1.0  # and noise tells the more
     moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
-    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept])
+    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept] * np.sqrt(uneven))
     form = form_covariance(nominal, moved_mm, found)
     design = motions(moved_mm, found.normals, nominal.pivot_mm)
     return Settled(
         fit=fit,
         kept=kept,
-        normal_matrix=design.T @ design,
+        normal_matrix=(design.T * share) @ design,
         information=known,
         form_covariance=form,
         certainty=certainty(nominal, known, form),

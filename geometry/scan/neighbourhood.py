@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from geometry.errors import BadInput
 from geometry.kernels.neighbours import k_nearest
-from geometry.types import Cloud, Ints
+from geometry.types import Cloud, Floats, Ints
+
+MOST_UNEVEN = 8.0  # a point stands for at most so many times the usual surface, and at least for that part
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,3 +36,29 @@ def nearest_of(cloud: Cloud, k: int) -> Ints:
         return cloud.nearest
     nearest, _ = k_nearest(cloud.points_mm, k)
     return nearest
+
+
+def surface_shares(points_mm: Floats, nearest: Ints) -> Floats:
+    """How much surface each point (n,) stands for, 1 in the mean: where views overlap, each for less.
+
+    The square of the distance to the j-th of the `nearest` (n, k) grows as j times the surface that a point
+    has; neighbours share what they tell.
+    """
+    squares_mm2, ranks = np.zeros(len(points_mm)), np.zeros(len(points_mm))
+    for rank, other in enumerate(nearest.T[1:], 1):
+        there = other >= 0
+        squares_mm2 += there * ((points_mm[other] - points_mm) ** 2).sum(axis=1)
+        ranks += there * rank
+    some = ranks > 0.0
+    if not some.any():
+        return np.ones(len(points_mm))
+    share = np.where(some, squares_mm2 / np.maximum(ranks, 1.0), 0.0)
+    share[~some] = np.median(share[some])
+    total, count = np.zeros(len(points_mm)), np.zeros(len(points_mm))
+    for other in nearest.T:
+        total += np.where(other >= 0, share[other], 0.0)
+        count += other >= 0
+    even = total / np.maximum(count, 1.0)
+    usual = max(float(np.median(even)), 1e-12)
+    even = np.clip(even / usual, 1.0 / MOST_UNEVEN, MOST_UNEVEN)
+    return np.asarray(even / even.mean())

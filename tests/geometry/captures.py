@@ -11,6 +11,7 @@ from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.damage.damages import Damage, find_damages
 from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
+from geometry.kernels.neighbours import k_nearest
 from geometry.registration.alignment import Alignment
 from geometry.registration.fit import Fit, felt, fit_kept
 from geometry.registration.register import mask_damage, register
@@ -18,6 +19,7 @@ from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
 from geometry.scan.calibrate import AxisCalibration
 from geometry.scan.clean import clean
 from geometry.scan.fuse import fuse
+from geometry.scan.neighbourhood import surface_shares
 from geometry.scan.overlap import refine_axis
 from geometry.transforms import apply, inverse
 from geometry.types import Bools, Cloud, Floats, Mesh, View
@@ -176,7 +178,8 @@ def known_pose(cloud: Cloud, known: Known, nominal: Nominal) -> Floats:
     found = nominal.closest(apply(known.T_true, cloud.points_mm))
     start = Fit(T_nominal_scan=known.T_true, found=found, weak=(), iterations=0, converged=False)
     kept = known.sound & felt(nominal, found)
-    return fit_kept(cloud.points_mm, start, kept, nominal, steps=20, close_mm=1e-7).T_nominal_scan
+    shares = kept * surface_shares(cloud.points_mm, k_nearest(cloud.points_mm, 17)[0])
+    return fit_kept(cloud.points_mm, start, shares, nominal, steps=20, close_mm=1e-7).T_nominal_scan
 
 
 def displacement_mm(T: Floats, T_other: Floats, nominal: Nominal) -> float:

@@ -6,7 +6,7 @@ import pytest
 from geometry.errors import BadInput
 from geometry.kernels.neighbours import k_nearest
 from geometry.scan.clean import CleanSettings, clean
-from geometry.scan.neighbourhood import nearest_of
+from geometry.scan.neighbourhood import nearest_of, surface_shares
 from geometry.types import Cloud
 from tests.geometry import blades
 
@@ -103,3 +103,17 @@ def test_a_handful_of_points_is_returned_as_it_is():
 def test_settings_that_contradict_themselves_are_refused(wrong):
     with pytest.raises(BadInput, match="clean"):
         CleanSettings(**wrong)
+
+
+def test_points_share_the_surface_they_lie_on():
+    """One half of a sheet four times as dense as the other, also where every third point was taken out."""
+    rng = np.random.default_rng(4)
+    points_mm = np.column_stack([rng.uniform(0.0, 40.0, (40_000, 2)), np.zeros(40_000)])
+    points_mm = points_mm[(points_mm[:, 0] < 20.0) | (rng.random(40_000) < 0.25)]
+    nearest = k_nearest(points_mm, 17)[0]
+    gone = np.arange(len(points_mm)) % 3 == 0
+    for known in (nearest, np.where(gone[nearest], -1, nearest)):
+        shares = surface_shares(points_mm, known)
+        dense, sparse = (shares[part].mean() for part in (points_mm[:, 0] < 19.0, points_mm[:, 0] > 21.0))
+        assert shares.mean() == pytest.approx(1.0)
+        assert sparse / dense == pytest.approx(4.0, rel=0.1)
