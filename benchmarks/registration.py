@@ -34,12 +34,11 @@ from scipy.interpolate import CubicSpline
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.blade.read import read_nominal
-from geometry.kernels.neighbours import k_nearest
 from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import CoarseSettings, find_pose
 from geometry.registration.ends import without_strays
 from geometry.registration.fit import Fit, fit_kept, motions
-from geometry.registration.register import mask_damage, register
+from geometry.registration.register import RegisterSettings, mask_damage, neighbours_of, register
 from geometry.registration.settled import held_by_ends
 from geometry.registration.uncertainty import certainty
 from geometry.scan.clean import clean
@@ -149,7 +148,7 @@ def known_pose(case: Case, nominal: Nominal) -> Floats:
     found = nominal.closest(apply(case.T_true, case.cloud.points_mm))
     start = Fit(T_nominal_scan=case.T_true, found=found, weak=(), iterations=0, converged=False)
     sound = case.scan.depth_mm == 0.0
-    shares = surface_shares(case.cloud.points_mm, k_nearest(case.cloud.points_mm, 17)[0])
+    shares = surface_shares(case.cloud.points_mm, neighbours_of(case.cloud, RegisterSettings()))
     fit = fit_kept(case.cloud.points_mm, start, sound * shares, nominal, steps=20, close_mm=1e-7)
     resting = without_strays(sound, sound, fit.found, nominal)
     return held_by_ends(case.cloud, fit, sound, resting * shares, nominal).fit.T_nominal_scan

@@ -9,10 +9,9 @@ thesis. Both methods get the same points, of which the thesis' takes a slab next
 product's a band of neighbouring heights. Figures are the largest of all draws and sections.
 
 The last tables set them against what noise allows, the bound of Cramer and Rao: for the product that of its
-band, for the thesis' that of the slab. No method that sees one slab only can
-be better: where the thesis' own figure is, its points were other than its words say. Points fall at random
-here, so that edges are left bare for a millimetre, where an even sampling leaves none. The thesis used
-36.35 s a section (table 4.2).
+band, for the thesis' that of the slab. No method that sees one slab only can be better: where the thesis' own
+figure is, its points were other than its words say. Points fall at random here, so that edges are left bare
+for a millimetre, where an even sampling leaves none. The thesis used 36.35 s a section (table 4.2).
 """
 
 import argparse

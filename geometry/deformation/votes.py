@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Closest
 from geometry.deformation.freeform import Freeform
@@ -12,6 +11,7 @@ from geometry.deformation.offset import Nodes
 from geometry.errors import CannotFitTwin
 from geometry.kernels.graph import dilate, group_medians, grow
 from geometry.robust import spread
+from geometry.scan.neighbourhood import next_to
 from geometry.types import Bools, Floats, Ints
 
 NO_NOISE_MM = 1e-5  # least scatter believed
@@ -174,14 +174,11 @@ def skin_at_rims(points_mm: Floats, sound: Bools, found: Found, nodes: Nodes, da
     takes to get so deep, and as far as to the first point that does. There only points well within the
     scatter about their node count.
     """
-    if sound.all() or not sound.any():
+    if not sound.any():
         return sound
     spacing_mm = np.sqrt(nodes.area_mm2[np.unique(found.owner[sound])].sum() / sound.sum())
-    rim_mm = spacing_mm + FLATTEST * damage_mm
-    to_off_mm, _ = cKDTree(points_mm[~sound]).query(points_mm[sound], distance_upper_bound=rim_mm)
-    owner, along_mm = found.owner[sound], found.along_mm[sound]
-    median_mm, _ = group_medians(owner, along_mm, len(nodes.points_mm))
-    apart_mm = np.abs(along_mm - median_mm[owner])
-    skin = sound.copy()
-    skin[sound] = np.isinf(to_off_mm) | (apart_mm <= max(WITHIN * spread(apart_mm), FLAT * damage_mm))
-    return skin
+    rim = next_to(points_mm, ~sound, spacing_mm + FLATTEST * damage_mm)
+    median_mm, _ = group_medians(found.owner[sound], found.along_mm[sound], len(nodes.points_mm))
+    apart_mm = np.abs(found.along_mm - median_mm[found.owner])
+    flat = apart_mm <= max(WITHIN * spread(apart_mm[sound]), FLAT * damage_mm)
+    return np.asarray(sound & (flat | ~rim))

@@ -21,10 +21,10 @@ from geometry.registration.fit import (
     unit_motions,
     unit_twist,
 )
-from geometry.registration.register import RegisterSettings, mask_damage
+from geometry.registration.register import RegisterSettings, mask_damage, neighbours_of
 from geometry.registration.uncertainty import certainty, form_covariance
 from geometry.robust import TUKEY, robust_sigma
-from geometry.scan.neighbourhood import nearest_of, surface_shares
+from geometry.scan.neighbourhood import surface_shares
 from geometry.threads import one_blas_thread
 from geometry.transforms import apply, exp, inverse, log
 from geometry.types import Bools, Cloud, Floats, Measurand, Unit
@@ -108,8 +108,8 @@ def _register_bands(
     few_mm = cloud.points_mm[chosen[every(len(chosen), settings.register.robust_points)]]
     robust = fit_robust(few_mm, start.T_nominal_scan, nominal)
     fit = replace(robust, found=nominal.closest(apply(robust.T_nominal_scan, cloud.points_mm)))
-    neighbours = nearest_of(cloud, min(settings.register.mask.neighbours + 1, len(cloud)))
-    shares, turns = surface_shares(cloud.points_mm, neighbours), robust.iterations
+    shares = surface_shares(cloud.points_mm, neighbours_of(cloud, settings.register))
+    turns = robust.iterations
     for _ in range(settings.register.rounds):
         here = replace(start, T_nominal_scan=fit.T_nominal_scan)
         sound = ~mask_damage(cloud, here, nominal, settings.register) & felt(nominal, fit.found)

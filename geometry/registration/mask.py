@@ -12,6 +12,7 @@ from geometry.kernels.graph import dilate, grow, neighbourhood_mean, neighbourho
 from geometry.kernels.neighbours import cell_index, counting_sort
 from geometry.kernels.parts import over_parts
 from geometry.robust import robust_sigma
+from geometry.scan.neighbourhood import next_to
 from geometry.types import Bools, Floats, Ints
 
 TURN_MM = 10.0  # a unit of normal counts as this far, so that the two sides of a thin edge are apart
@@ -94,7 +95,7 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
     limit_mm = max(settings.form_mm, 4.0 * scatter_mm)
     near = off_mm <= limit_mm
     for _ in range(REACHES):
-        beside = _next_to(place[few], ~near, settings.rim_mm) & (off_mm > settings.usual * scatter_mm)
+        beside = next_to(place[few], ~near, settings.rim_mm) & (off_mm > settings.usual * scatter_mm)
         chosen = few[near & ~beside]
         if len(chosen) < settings.form_window:  # nothing of the nominal's form is left to tell
             return np.zeros(len(points_mm))
@@ -134,14 +135,6 @@ def _one_to_a_cell(place: Floats, most: int) -> Ints:
         first = np.unique(cells, return_index=True)[1]
         cell_mm *= np.sqrt(len(first) / most)
     return np.sort(first)
-
-
-def _next_to(place: Floats, off: Bools, rim_mm: float) -> Bools:
-    """Of the points (n, 6) those within `rim_mm` of one that is off."""
-    if not off.any():
-        return off
-    apart_mm, _ = cKDTree(place[off]).query(place, distance_upper_bound=np.nextafter(rim_mm, np.inf))
-    return np.isfinite(apart_mm)
 
 
 def _every_nth(count: int, most: int) -> Ints:

@@ -57,10 +57,16 @@ def register(cloud: Cloud, nominal: Nominal, settings: RegisterSettings = Regist
     cloud = _thinned(cloud, settings.fit_points)
     few_mm = cloud.points_mm[every(len(cloud), settings.robust_points)]
     robust = fit_robust(few_mm, coarse.T_nominal_scan, nominal)
-    neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
-    settled = _settled(cloud, robust, neighbours, nominal, settings)
-    places = [settled, *_elsewhere(cloud, settled, neighbours, nominal, settings)]
+    neighbours = neighbours_of(cloud, settings)
+    shares = surface_shares(cloud.points_mm, neighbours)
+    settled = _settled(cloud, robust, neighbours, shares, nominal, settings)
+    places = [settled, *_elsewhere(cloud, settled, neighbours, shares, nominal, settings)]
     return _alignment(cloud, nominal, places, coarse, robust.iterations, settings)
+
+
+def neighbours_of(cloud: Cloud, settings: RegisterSettings) -> Ints:
+    """The neighbours (n, k) of each point that mask and shares go by, the point itself first; -1 none."""
+    return nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
 
 
 def _thinned(cloud: Cloud, most: int) -> Cloud:
@@ -71,14 +77,18 @@ def _thinned(cloud: Cloud, most: int) -> Cloud:
 
 
 def _settled(
-    cloud: Cloud, start: Fit, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
+    cloud: Cloud,
+    start: Fit,
+    neighbours: Ints,
+    shares: Floats,
+    nominal: Nominal,
+    settings: RegisterSettings,
 ) -> Settled:
     """Rounds of mask and least squares on the whole cloud.
 
     The fit rests on the ring round damage, too: each sound point left out lets form into the pose. It is
     one to the surface, however densely each part of it was seen.
     """
-    shares = surface_shares(cloud.points_mm, neighbours)
     found, turns = nominal.closest(apply(start.T_nominal_scan, cloud.points_mm)), 0
     fit = replace(start, found=found)
     for _ in range(settings.rounds):
@@ -107,7 +117,12 @@ def _past_rims_none(moved_mm: Floats, found: Closest, nominal: Nominal, aside_mm
 
 
 def _elsewhere(
-    cloud: Cloud, settled: Settled, neighbours: Ints, nominal: Nominal, settings: RegisterSettings
+    cloud: Cloud,
+    settled: Settled,
+    neighbours: Ints,
+    shares: Floats,
+    nominal: Nominal,
+    settings: RegisterSettings,
 ) -> list[Settled]:
     """Other poses along the least certain motion that explain more of the scan and are surer of it."""
     sigma_mm, twist = float(settled.certainty.sigma_mm[-1]), settled.certainty.twists[:, -1]
@@ -120,7 +135,7 @@ def _elsewhere(
     places = []
     for move_mm in slides_mm(moved_mm[settled.kept], moved_mm[off], twist, 4.0 * sigma_mm, near_mm, nominal):
         moved = replace(settled.fit, T_nominal_scan=exp(move_mm * twist, nominal.pivot_mm) @ T)
-        place = _settled(cloud, moved, neighbours, nominal, settings)
+        place = _settled(cloud, moved, neighbours, shares, nominal, settings)
         surer = place.certainty.sigma_mm[-1] < 0.5 * sigma_mm
         if surer and place.kept.sum() >= settled.kept.sum() + LEAST:
             places.append(place)
@@ -190,5 +205,5 @@ def mask_damage(
 ) -> Bools:
     """The points (n,) of an aligned cloud that lie on damage, with the points next to it."""
     found = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
-    neighbours = nearest_of(cloud, min(settings.mask.neighbours + 1, len(cloud)))
+    neighbours = neighbours_of(cloud, settings)
     return ringed(_damage_of(cloud, found, neighbours, settings.mask), neighbours, settings.mask)

@@ -1,12 +1,15 @@
-"""A cloud that brings the nearest neighbours of its points along, so that no later step searches again."""
+"""Points and their neighbours: a cloud that brings the nearest along, so that no later step searches again;
+how much surface each point stands for, and which lie next to others."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from geometry.errors import BadInput
+from geometry.kernels.graph import neighbourhood_mean
 from geometry.kernels.neighbours import k_nearest
-from geometry.types import Cloud, Floats, Ints
+from geometry.types import Bools, Cloud, Floats, Ints
 
 MOST_UNEVEN = 8.0  # a point stands for at most so many times the usual surface, and at least for that part
 
@@ -54,11 +57,15 @@ def surface_shares(points_mm: Floats, nearest: Ints) -> Floats:
         return np.ones(len(points_mm))
     share = np.where(some, squares_mm2 / np.maximum(ranks, 1.0), 0.0)
     share[~some] = np.median(share[some])
-    total, count = np.zeros(len(points_mm)), np.zeros(len(points_mm))
-    for other in nearest.T:
-        total += np.where(other >= 0, share[other], 0.0)
-        count += other >= 0
-    even = total / np.maximum(count, 1.0)
+    even = neighbourhood_mean(share, nearest[:, 1:])
     usual = max(float(np.median(even)), 1e-12)
     even = np.clip(even / usual, 1.0 / MOST_UNEVEN, MOST_UNEVEN)
     return np.asarray(even / even.mean())
+
+
+def next_to(places: Floats, off: Bools, reach: float) -> Bools:
+    """Which of the places (n, d) lie within reach of one that is off (n,)."""
+    if not off.any():
+        return off
+    apart, _ = cKDTree(places[off]).query(places, distance_upper_bound=np.nextafter(reach, np.inf))
+    return np.asarray(np.isfinite(apart))

@@ -11,10 +11,9 @@ from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.damage.damages import Damage, find_damages
 from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin, TwinSettings, fit_twin
-from geometry.kernels.neighbours import k_nearest
 from geometry.registration.alignment import Alignment
 from geometry.registration.fit import Fit, felt, fit_kept
-from geometry.registration.register import mask_damage, register
+from geometry.registration.register import RegisterSettings, mask_damage, neighbours_of, register
 from geometry.repair.patches import RepairSettings, RepairVolume, find_repairs
 from geometry.scan.calibrate import AxisCalibration
 from geometry.scan.clean import clean
@@ -178,7 +177,7 @@ def known_pose(cloud: Cloud, known: Known, nominal: Nominal) -> Floats:
     found = nominal.closest(apply(known.T_true, cloud.points_mm))
     start = Fit(T_nominal_scan=known.T_true, found=found, weak=(), iterations=0, converged=False)
     kept = known.sound & felt(nominal, found)
-    shares = kept * surface_shares(cloud.points_mm, k_nearest(cloud.points_mm, 17)[0])
+    shares = kept * surface_shares(cloud.points_mm, neighbours_of(cloud, RegisterSettings()))
     return fit_kept(cloud.points_mm, start, shares, nominal, steps=20, close_mm=1e-7).T_nominal_scan
 
 

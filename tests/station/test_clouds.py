@@ -386,9 +386,8 @@ def folded(gap_mm: float) -> Mesh:
     gone, each pyramid is two facets back to back."""
     ring = [[0.0, 0.0, 0.0], [gap_mm, 0.0, 0.0], [0.5, 1.0, 0.0]]
     vertices: Floats = np.array([*ring, [0.5, 0.5, 1.0], [0.5, 0.5, -1.0]]) + 100.0
-    faces = [[a, b, 3] for a, b in ((0, 1), (1, 2), (2, 0))] + [
-        [b, a, 4] for a, b in ((0, 1), (1, 2), (2, 0))
-    ]
+    sides = ((0, 1), (1, 2), (2, 0))
+    faces = [[a, b, 3] for a, b in sides] + [[b, a, 4] for a, b in sides]
     return Mesh(vertices_mm=vertices, faces=np.array(faces, np.int64))
 
 
