@@ -108,6 +108,7 @@ def alignment_of(alignment: Alignment | None) -> Json | None:
         "pivot_mm": alignment.pivot_mm.tolist(),
         "information": alignment.information.tolist(),
         "form_covariance": alignment.form_covariance.tolist(),
+        "unseen_covariance": alignment.unseen_covariance.tolist(),
         "rms_mm": alignment.rms_mm,
         "noise_mm": alignment.noise_mm,
         "inlier_fraction": alignment.inlier_fraction,

@@ -6,6 +6,8 @@ import numpy as np
 
 from geometry.types import Floats
 
+FREE = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0])  # rad and mm: sigmas of a motion that nothing holds
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Alignment:
@@ -15,7 +17,9 @@ class Alignment:
     then shifts, applied on the nominal side: `exp(twist, pivot_mm) @ T_nominal_scan`.
     `information` (6, 6) is the inverse covariance of that twist from point noise alone;
     `form_covariance` (6, 6) is what the form of the part adds to that covariance: deviations that many
-    neighbouring points share. Both together are the uncertainty of the pose.
+    neighbouring points share. Both together are the uncertainty of the pose. `unseen_covariance` (6, 6) is
+    what of it the best fit of the whole part, all seen and sound, would not have: with the noise it is the
+    uncertainty of what is measured from that best fit.
     """
 
     method: str
@@ -31,12 +35,21 @@ class Alignment:
     iterations: int
     converged: bool
     form_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    unseen_covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+
+
+def noise_covariance(alignment: Alignment) -> Floats:
+    """Covariance (6, 6) of the pose twist from noise; where the surface leaves it free, that of `FREE`."""
+    return np.linalg.inv(alignment.information + np.diag(FREE**-2.0)).astype(np.float64)
 
 
 def pose_covariance(alignment: Alignment) -> Floats:
-    """Covariance (6, 6) of the pose twist from noise; where the surface leaves it free, 1 mm or 0.02 rad."""
-    prior = np.array([0.02, 0.02, 0.02, 1.0, 1.0, 1.0]) ** -2.0
-    return np.linalg.inv(alignment.information + np.diag(prior)).astype(np.float64)
+    """Covariance (6, 6) of the twist from the best fit of the whole part: of noise and of what was not seen.
+
+    Where noise, or what was not seen, leaves a motion free, it counts as `FREE` at most.
+    """
+    unseen, free = alignment.unseen_covariance, np.diag(FREE**2.0)
+    return noise_covariance(alignment) + unseen @ np.linalg.solve(free + unseen, free)
 
 
 def variance_along(alignment: Alignment, point_mm: Floats, normal: Floats) -> float:

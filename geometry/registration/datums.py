@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Closest, Nominal
 from geometry.errors import BadInput, CannotRegister
-from geometry.registration.alignment import Alignment, pose_covariance
+from geometry.registration.alignment import Alignment, noise_covariance
 from geometry.registration.fit import (
     Fit,
     every,
@@ -21,8 +21,9 @@ from geometry.registration.fit import (
     unit_motions,
     unit_twist,
 )
+from geometry.registration.form_effect import Surface, form_effect
 from geometry.registration.register import RegisterSettings, mask_damage, neighbours_of
-from geometry.registration.uncertainty import certainty, form_covariance
+from geometry.registration.uncertainty import certainty
 from geometry.robust import TUKEY, robust_sigma
 from geometry.scan.neighbourhood import surface_shares
 from geometry.threads import one_blas_thread
@@ -118,7 +119,18 @@ def _register_bands(
         fit = fit_kept(cloud.points_mm, fit, kept * shares, nominal)
         turns += fit.iterations
     share = float(kept.sum() / _inside(fit.found.points_mm[:, 2], bands, 0.0).sum())
-    return _alignment(cloud, nominal, start, replace(fit, iterations=turns), kept, share, method, settings)
+    fit, whole = replace(fit, iterations=turns), _surface(nominal, bands)
+    return _alignment(cloud, nominal, start, fit, kept * shares, whole, share, method, settings)
+
+
+def _surface(nominal: Nominal, bands: Sequence[tuple[float, float]]) -> Surface:
+    """What of the nominal a scan may see in the bands."""
+    inside = _inside(nominal.shell_mm[:, 2], bands, 0.0)
+    return Surface(
+        points_mm=nominal.shell_mm[inside],
+        normals=nominal.shell_normals[inside],
+        shares=np.ones(int(inside.sum())),
+    )
 
 
 def _alignment(
@@ -126,16 +138,19 @@ def _alignment(
     nominal: Nominal,
     start: Alignment,
     fit: Fit,
-    kept: Bools,
-    share: float,
+    shares: Floats,
+    whole: Surface,
+    sound: float,
     method: str,
     settings: DatumSettings,
 ) -> Alignment:
-    """The alignment of a fit to the kept points; whether it is this part at all was for `start` to tell."""
+    """The alignment of a fit to points for their shares (n,) of the `whole` zone; whether it is this part at
+    all was for `start` to tell."""
+    kept = shares > 0.0
     moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
-    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept])
-    form = form_covariance(nominal, moved_mm, found)
-    left = certainty(nominal, known, form)
+    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept], shares[kept])
+    effect = form_effect(nominal, moved_mm, found, shares[kept], whole)
+    left = certainty(nominal, known, effect.form)
     loose = tuple(unit_twist(t) for t in left.twists.T[left.sigma_mm > settings.register.loose_mm])
     return replace(
         start,
@@ -143,11 +158,12 @@ def _alignment(
         T_nominal_scan=fit.T_nominal_scan,
         pivot_mm=nominal.pivot_mm,
         information=known,
-        form_covariance=form,
+        form_covariance=effect.form,
+        unseen_covariance=effect.unseen,
         weak_directions=loose if len(loose) > len(fit.weak) else fit.weak,
         rms_mm=float(np.sqrt(np.mean(found.distance_mm**2))),
         noise_mm=robust_sigma(found.distance_mm),
-        inlier_fraction=share,
+        inlier_fraction=sound,
         iterations=fit.iterations,
         converged=fit.converged,
     )
@@ -232,6 +248,7 @@ def register_six_point(
         pivot_mm=nominal.pivot_mm,
         information=rows.T @ rows,
         form_covariance=np.zeros((6, 6)),
+        unseen_covariance=np.zeros((6, 6)),
         weak_directions=(),
         rms_mm=float(np.sqrt(np.mean(standing.residual_mm**2))),
         noise_mm=robust_sigma(standing.residual_mm),
@@ -318,7 +335,7 @@ def service_motion(root: Alignment, airfoil: Alignment, nominal: Nominal) -> Ser
     """
     moved = root.T_nominal_scan @ inverse(airfoil.T_nominal_scan)
     twist = log(moved, nominal.pivot_mm)
-    covariance = sum(pose_covariance(each) + each.form_covariance for each in (root, airfoil))
+    covariance = sum(noise_covariance(each) + each.form_covariance for each in (root, airfoil))
     turns = np.rad2deg(np.sqrt(np.diag(covariance)[:3]))
     tip_mm = 0.5 * (nominal.le_line_mm[-1] + nominal.te_line_mm[-1])
     shift_mm = apply(moved, tip_mm[None])[0] - tip_mm

@@ -165,9 +165,15 @@ def fit_kept(
     return Fit(T_nominal_scan=T, found=found, weak=weak, iterations=taken, converged=size_mm < close_mm)
 
 
-def information(nominal: Nominal, moved_mm: Floats, normals: Floats, sigma_mm: Floats) -> Floats:
-    """Inverse covariance (6, 6) of the twist about the pivot, from independent noise along the normals."""
-    design = motions(moved_mm, normals, nominal.pivot_mm) / sigma_mm[:, None]
+def information(
+    nominal: Nominal, moved_mm: Floats, normals: Floats, sigma_mm: Floats, shares: Floats | float = 1.0
+) -> Floats:
+    """Inverse covariance (6, 6) of the twist about the pivot, from independent noise along the normals.
+
+    Of points that count for uneven `shares` (n,) of the fit noise averages away less.
+    """
+    uneven = float(np.mean(np.square(shares)) / np.mean(shares) ** 2)
+    design = motions(moved_mm, normals, nominal.pivot_mm) / (sigma_mm * np.sqrt(uneven))[:, None]
     return np.asarray(design.T @ design)
 
 

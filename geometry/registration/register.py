@@ -168,6 +168,7 @@ def _alignment(
         pivot_mm=nominal.pivot_mm,
         information=settled.information,
         form_covariance=settled.form_covariance,
+        unseen_covariance=settled.unseen_covariance,
         weak_directions=_weak(places, settings),
         rms_mm=float(np.sqrt(np.mean(residual_mm**2))),
         noise_mm=robust_sigma(residual_mm),

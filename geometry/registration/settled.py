@@ -7,7 +7,8 @@ import numpy as np
 from geometry.blade.nominal import Nominal
 from geometry.registration.ends import End, scan_ends
 from geometry.registration.fit import Fit, Held, felt, fit_kept, information, motions, unit_motions
-from geometry.registration.uncertainty import Certainty, certainty, form_covariance, free_inverse
+from geometry.registration.form_effect import form_effect, required
+from geometry.registration.uncertainty import Certainty, certainty, free_inverse
 from geometry.transforms import apply, inverse
 from geometry.types import Bools, Cloud, Floats
 
@@ -26,6 +27,7 @@ class Settled:
     normal_matrix: Floats  # (6, 6) of the kept points, each by its share
     information: Floats
     form_covariance: Floats
+    unseen_covariance: Floats
     certainty: Certainty
 
 
@@ -59,18 +61,18 @@ def held_by_ends(cloud: Cloud, fit: Fit, sound: Bools, shares: Floats, nominal: 
 def _worth(cloud: Cloud, fit: Fit, shares: Floats, nominal: Nominal) -> Settled:
     kept = (shares > 0.0) & felt(nominal, fit.found)
     share = shares[kept]
-    uneven = float(np.mean(share**2) / np.mean(share) ** 2) if kept.any() else 1.0  # and noise tells the more
     moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
-    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept] * np.sqrt(uneven))
-    form = form_covariance(nominal, moved_mm, found)
+    known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept], share)
+    effect = form_effect(nominal, moved_mm, found, share, required(nominal))
     design = motions(moved_mm, found.normals, nominal.pivot_mm)
     return Settled(
         fit=fit,
         kept=kept,
         normal_matrix=(design.T * share) @ design,
         information=known,
-        form_covariance=form,
-        certainty=certainty(nominal, known, form),
+        form_covariance=effect.form,
+        unseen_covariance=effect.unseen,
+        certainty=certainty(nominal, known, effect.form),
     )
 
 
@@ -106,5 +108,6 @@ def _with_ends(settled: Settled, fit: Fit, held: Held, ends: tuple[End, ...], no
         fit=fit,
         information=known,
         form_covariance=form,
+        unseen_covariance=share @ settled.unseen_covariance @ share.T,
         certainty=certainty(nominal, known, form),
     )

@@ -1,4 +1,4 @@
-"""The stated uncertainty of a pose against the scatter of many."""
+"""What noise and the form of a part are said to do to its pose, against what they do to many."""
 
 from functools import cache
 
@@ -7,7 +7,8 @@ import pytest
 
 from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.registration.fit import Fit, fit_kept, information
-from geometry.registration.uncertainty import certainty, form_covariance
+from geometry.registration.form_effect import form_effect, required
+from geometry.registration.uncertainty import certainty
 from geometry.transforms import apply, log
 from tests.geometry import blades
 
@@ -26,17 +27,25 @@ def exact(blade=BLADE, per_mm2=0.4):
     return nominal(blade).closest(blades.scan(blade, per_mm2, np.random.default_rng(1)).points_mm)
 
 
+def effect_of(nominal_, moved_mm, found):
+    return form_effect(nominal_, moved_mm, found, np.ones(len(moved_mm)), required(nominal_))
+
+
 def fitted(residual_mm, blade=BLADE, per_mm2=0.4):
     """The twist that least squares gives points off the surface by `residual_mm`, and the stated parts."""
-    feet = exact(blade, per_mm2)
+    twist, known, effect = fitted_to(exact(blade, per_mm2), residual_mm, blade)
+    return twist, known, effect.form
+
+
+def fitted_to(feet, residual_mm, blade=BLADE):
     points_mm = feet.points_mm + residual_mm[:, None] * feet.normals
     found = nominal(blade).closest(points_mm)
     start = Fit(T_nominal_scan=np.eye(4), found=found, weak=(), iterations=0, converged=False)
     fit = fit_kept(points_mm, start, np.ones(len(points_mm), bool), nominal(blade))
     moved_mm = apply(fit.T_nominal_scan, points_mm)
     known = information(nominal(blade), moved_mm, fit.found.normals, np.full(len(points_mm), SIGMA_MM))
-    form = form_covariance(nominal(blade), moved_mm, fit.found)
-    return log(fit.T_nominal_scan, nominal(blade).pivot_mm), known, form
+    effect = effect_of(nominal(blade), moved_mm, fit.found)
+    return log(fit.T_nominal_scan, nominal(blade).pivot_mm), known, effect
 
 
 def scaled_errors(residuals, blade=BLADE):
@@ -66,18 +75,59 @@ def test_the_form_is_stated_within_a_factor_of_a_few():
     """A smooth random form: what it does to the pose is far above the noise, and covered."""
     rng = np.random.default_rng(4)
     feet_mm, normals = exact().points_mm, exact().normals
-    residuals = []
-    for _ in range(25):
-        waves = rng.normal(scale=[0.08, 0.3, 0.08], size=(12, 3))
-        phases, sizes = rng.uniform(0, 2 * np.pi, 12), rng.normal(scale=0.008, size=12)
-        side = np.where(rng.random(12)[:, None] < 0.5, 1.0, np.sign(normals[:, 1] + 1e-12))
-        form = (sizes[:, None] * side * np.sin(waves @ feet_mm.T + phases[:, None])).sum(axis=0)
-        residuals.append(form + rng.normal(scale=SIGMA_MM, size=len(form)))
+    forms = [smooth_form(feet_mm, normals, rng) for _ in range(25)]
+    residuals = [form + rng.normal(scale=SIGMA_MM, size=len(form)) for form in forms]
     spread = np.sqrt(np.mean(scaled_errors(residuals) ** 2, axis=0))
     assert ((spread > 0.15) & (spread < 2.5)).all()
     twists = np.array([fitted(residual)[0] for residual in residuals[:8]])
     noise_mm = np.sqrt(np.linalg.inv(fitted(residuals[0])[1])[3, 3])
     assert np.sqrt(np.mean(twists[:, 3] ** 2)) > 3.0 * noise_mm
+
+
+def smooth_form(feet_mm, normals, rng):
+    """A random form (n,) of a few waves of about 20 mm and more."""
+    waves = rng.normal(scale=[0.08, 0.3, 0.08], size=(12, 3))
+    phases, sizes = rng.uniform(0, 2 * np.pi, 12), rng.normal(scale=0.008, size=12)
+    side = np.where(rng.random(12)[:, None] < 0.5, 1.0, np.sign(normals[:, 1] + 1e-12))
+    return (sizes[:, None] * side * np.sin(waves @ feet_mm.T + phases[:, None])).sum(axis=0)
+
+
+def unseen_errors(seen_of, draws=25, seed=8):
+    """Errors (draws, 6) of the pose of what is seen (n,) from the whole part's, in stated sigmas."""
+    rng, feet = np.random.default_rng(seed), exact()
+    scaled = []
+    for _ in range(draws):
+        form = smooth_form(feet.points_mm, feet.normals, rng)
+        seen = seen_of(feet.points_mm, feet.normals)
+        whole, _, _ = fitted_to(feet, form)
+        noise = rng.normal(scale=SIGMA_MM, size=int(seen.sum()))
+        twist, known, effect = fitted_to(feet.of(seen), form[seen] + noise)
+        stated = certainty(nominal(), known, effect.unseen)
+        scaled.append(np.linalg.solve(stated.twists, twist - whole) / stated.sigma_mm)
+    return np.array(scaled)
+
+
+@pytest.mark.parametrize(
+    "seen_of",
+    [
+        lambda points_mm, normals: points_mm[:, 2] < 80.0,
+        lambda points_mm, normals: (normals[:, 1] > 0.0) | (points_mm[:, 0] > 12.0),
+        lambda points_mm, normals: (points_mm[:, 2] % 20.0 < 14.0) | (normals[:, 1] < 0.0),
+    ],
+    ids=["no upper quarter", "one side in part", "patches of one side"],
+)
+def test_what_was_not_seen_of_the_form_is_stated(seen_of):
+    """The pose of a part of the surface is as far from that of all of it as stated."""
+    spread = np.sqrt(np.mean(unseen_errors(seen_of) ** 2, axis=0))
+    assert ((spread > 0.2) & (spread < 2.5)).all()
+
+
+def test_nothing_is_unseen_where_all_is_seen():
+    rng = np.random.default_rng(9)
+    feet = exact(per_mm2=5.0)
+    form = smooth_form(feet.points_mm, feet.normals, rng)
+    _, _, effect = fitted_to(feet, form + rng.normal(scale=SIGMA_MM, size=len(form)))
+    assert np.trace(effect.unseen) < 0.01 * np.trace(effect.form)
 
 
 @pytest.mark.parametrize("waves", [3, 6, 12])
@@ -123,7 +173,7 @@ def test_flat_facets_are_no_surface():
     points_mm = exact().points_mm[exact().points_mm[:, 2] < 30.0]
     found = coarse.closest(points_mm)
     kept = ~coarse.end_face[found.face]
-    form = form_covariance(coarse, points_mm[kept], found.of(kept))
+    form = effect_of(coarse, points_mm[kept], found.of(kept)).form
     assert np.sqrt(form[5, 5]) > 0.1
 
 
