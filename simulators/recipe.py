@@ -14,6 +14,7 @@ Verdict = Literal["PASS", "REPAIR", "SCRAP", "HOLD"]
 Limits = Mapping[str, tuple[float, float]]  # characteristic -> serviceable, repairable
 
 SIGMA_MM = 0.015  # that the plan states for a scan point, along the normal
+MERGE_MM = 0.005  # and for the merging of views about a calibrated axis
 SECTION_LIMITS: Limits = {
     "position_mm": (0.15, 0.60),
     "orientation_deg": (0.40, 1.50),
@@ -90,6 +91,7 @@ def plan_toml(recipe: Recipe, sigma_mm: float = SIGMA_MM) -> str:
         "[measurement]",
         f"sigma_mm = {sigma_mm!r}",
         "coverage_factor = 2.0",
+        f"merge_mm = {MERGE_MM!r}",
         "",
         "[airfoil]",
         f"z_min_mm = {recipe.z_min_mm!r}",

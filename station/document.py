@@ -56,7 +56,7 @@ def document(measurement: Measurement, verdict: Verdict, plan: BladePlan, inputs
         "revision": plan.revision,
         "serial": inputs.serial,
         "alignment": alignment_of(measurement.alignment),
-        "axis_mm": measurement.axis_mm,
+        "merge_mm": measurement.merge_mm,
         "service_motion": service_of(measurement.service),
         "sections": [section_of(section) for section in measurement.sections],
         "blade": blade_of(measurement.line),

@@ -65,13 +65,15 @@ def conclude(state: Views, recipe: Recipe, clock: Clock, progress: Progress) -> 
     merged = run.step("fuse", fused, views, recipe)
     if merged is None:
         return run.measurement(sum(len(view.points_mm) for view in views))
-    cloud, axis_mm = merged
-    return widened(measured(cloud, recipe, run), axis_mm)
+    cloud, merge_mm = merged
+    return widened(measured(cloud, recipe, run), merge_mm)
 
 
 def measure_cloud(cloud: Cloud, recipe: Recipe, clock: Clock, progress: Progress) -> Measurement:
     """The measurement of a cloud that was merged elsewhere."""
-    return measured(cloud, recipe, Run(clock=clock, progress=progress))
+    found = measured(cloud, recipe, Run(clock=clock, progress=progress))
+    merge_mm = recipe.plan.measurement.merge_mm
+    return widened(found, merge_mm) if merge_mm > 0.0 else found
 
 
 def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:

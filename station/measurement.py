@@ -48,7 +48,7 @@ class Measurement:
     """
 
     points: int  # as read, before cleaning
-    axis_mm: float | None = None  # standard uncertainty that the turntable leaves to a point of merged views
+    merge_mm: float | None = None  # standard uncertainty along the normal that merging left to a point
     alignment: Alignment | None = None
     service: ServiceMotion | NotMeasured | None = None
     aligned_mm: Floats = field(default_factory=lambda: NO_POINTS)

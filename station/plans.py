@@ -94,6 +94,7 @@ class CountLimit(Limit):
 class Measurement(Settings):
     sigma_mm: Positive
     coverage_factor: Positive = 2.0
+    merge_mm: NonNegative = 0.0  # of a scan merged elsewhere; of its own merging the station tells it itself
 
 
 class Airfoil(Settings):

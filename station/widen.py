@@ -1,4 +1,4 @@
-"""What the turntable's axis leaves open, added to the uncertainty of what merged views gave. Pure."""
+"""What the merging of views leaves open, added to the uncertainty of what the merged views gave. Pure."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from station.measurement import Measurement
 
 
-def widened(found: Measurement, axis_mm: float) -> Measurement:
-    """The measurement with `axis_mm`, the standard uncertainty of a surface point, in each of its sigmas.
+def widened(found: Measurement, merge_mm: float) -> Measurement:
+    """The measurement with `merge_mm`, the standard uncertainty of a surface point, in each of its sigmas.
 
     The views of two sides of a blade may be shifted against each other by as much: a length takes it whole,
     an angle over half the chord, a volume over the skin that was lost.
     """
     return replace(
         found,
-        axis_mm=axis_mm,
-        sections=tuple(_section(section, axis_mm) for section in found.sections),
-        line=None if found.line is None else _line(found.line, found.sections, axis_mm),
-        form_mm=wider(found.form_mm, axis_mm),
-        damages=None if found.damages is None else tuple(_damage(each, axis_mm) for each in found.damages),
-        repairs=None if found.repairs is None else _repairs(found.repairs, axis_mm),
+        merge_mm=merge_mm,
+        sections=tuple(_section(section, merge_mm) for section in found.sections),
+        line=None if found.line is None else _line(found.line, found.sections, merge_mm),
+        form_mm=wider(found.form_mm, merge_mm),
+        damages=None if found.damages is None else tuple(_damage(each, merge_mm) for each in found.damages),
+        repairs=None if found.repairs is None else _repairs(found.repairs, merge_mm),
     )
 
 
@@ -40,9 +40,9 @@ def wider(measured: Measured, more: float) -> Measured:
     return measured
 
 
-def _section(section: Section, axis_mm: float) -> Section:
-    turn_deg = degrees(axis_mm / _half_chord_mm(section))
-    more = {"mm": axis_mm, "deg": turn_deg}
+def _section(section: Section, merge_mm: float) -> Section:
+    turn_deg = degrees(merge_mm / _half_chord_mm(section))
+    more = {"mm": merge_mm, "deg": turn_deg}
     return replace(
         section,
         measurands={
@@ -56,16 +56,16 @@ def _half_chord_mm(section: Section) -> float:
     return 0.5 * section.nominals["chord_mm"]
 
 
-def _line(line: BladeLine, sections: tuple[Section, ...], axis_mm: float) -> BladeLine:
+def _line(line: BladeLine, sections: tuple[Section, ...], merge_mm: float) -> BladeLine:
     heights_mm = [section.z_mm for section in sections if section.stacking is not None]
     span_mm = max(heights_mm, default=0.0) - min(heights_mm, default=0.0)
-    lean_deg = degrees(axis_mm / span_mm) if span_mm > 0.0 else 0.0
-    twist_deg = sqrt(2.0) * degrees(axis_mm / min(_half_chord_mm(section) for section in sections))
+    lean_deg = degrees(merge_mm / span_mm) if span_mm > 0.0 else 0.0
+    twist_deg = sqrt(2.0) * degrees(merge_mm / min(_half_chord_mm(section) for section in sections))
     return replace(
         line,
         lean_x_deg=_judged(line.lean_x_deg, lean_deg),
         lean_y_deg=_judged(line.lean_y_deg, lean_deg),
-        bow_mm=_judged(line.bow_mm, axis_mm),
+        bow_mm=_judged(line.bow_mm, merge_mm),
         relative_twist=tuple(
             replace(each, twist_deg=_judged(each.twist_deg, twist_deg)) for each in line.relative_twist
         ),
@@ -76,29 +76,29 @@ def _judged(judged: Judged, more: float) -> Judged:
     return replace(judged, measured=wider(judged.measured, more))
 
 
-def _damage(damage: Damage, axis_mm: float) -> Damage:
+def _damage(damage: Damage, merge_mm: float) -> Damage:
     return replace(
         damage,
-        depth_mm=wider(damage.depth_mm, axis_mm),
-        remaining_chord_mm=wider(damage.remaining_chord_mm, axis_mm),
-        volume_mm3=wider(damage.volume_mm3, _volume_mm3(damage.area_mm2, axis_mm)),
+        depth_mm=wider(damage.depth_mm, merge_mm),
+        remaining_chord_mm=wider(damage.remaining_chord_mm, merge_mm),
+        volume_mm3=wider(damage.volume_mm3, _volume_mm3(damage.area_mm2, merge_mm)),
     )
 
 
-def _volume_mm3(area_mm2: Measured, axis_mm: float) -> float:
-    return area_mm2.value * axis_mm if isinstance(area_mm2, Measurand) else 0.0
+def _volume_mm3(area_mm2: Measured, merge_mm: float) -> float:
+    return area_mm2.value * merge_mm if isinstance(area_mm2, Measurand) else 0.0
 
 
-def _repairs(repairs: RepairVolume, axis_mm: float) -> RepairVolume:
-    more_mm3 = sum(_volume_mm3(patch.area_mm2, axis_mm) for patch in repairs.patches)
+def _repairs(repairs: RepairVolume, merge_mm: float) -> RepairVolume:
+    more_mm3 = sum(_volume_mm3(patch.area_mm2, merge_mm) for patch in repairs.patches)
     return replace(
         repairs,
-        patches=tuple(_patch(patch, axis_mm) for patch in repairs.patches),
+        patches=tuple(_patch(patch, merge_mm) for patch in repairs.patches),
         volume_mm3=replace(repairs.volume_mm3, sigma=hypot(repairs.volume_mm3.sigma, more_mm3)),
     )
 
 
-def _patch(patch: Patch, axis_mm: float) -> Patch:
+def _patch(patch: Patch, merge_mm: float) -> Patch:
     volume = patch.volume_mm3
-    more_mm3 = _volume_mm3(patch.area_mm2, axis_mm)
+    more_mm3 = _volume_mm3(patch.area_mm2, merge_mm)
     return replace(patch, volume_mm3=replace(volume, sigma=hypot(volume.sigma, more_mm3)))

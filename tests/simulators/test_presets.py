@@ -100,7 +100,7 @@ def test_the_recipe_has_a_nominal_that_is_the_blade(tmp_path: Path) -> None:
     assert plan["airfoil"]["z_min_mm"] == 6.0
     assert plan["airfoil"]["z_max_mm"] == 105.0
     assert set(plan["limits"]["damage"]) == {"tip", "leading_edge", "trailing_edge", "surface"}
-    assert plan["measurement"] == {"sigma_mm": 0.015, "coverage_factor": 2.0}
+    assert plan["measurement"] == {"sigma_mm": 0.015, "coverage_factor": 2.0, "merge_mm": 0.005}
 
 
 def test_the_true_pose_takes_the_scan_onto_the_nominal() -> None:

@@ -98,9 +98,9 @@ def geometry(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return given
 
 
-def measured(clock: Callable[[], float] | None = None) -> Any:
+def measured(clock: Callable[[], float] | None = None, **changed: Any) -> Any:
     heard: list[str] = []
-    done = measure_cloud(as_cloud(POINTS, 0.015), recipe(), clock or ticks(), heard.append)
+    done = measure_cloud(as_cloud(POINTS, 0.015), recipe(**changed), clock or ticks(), heard.append)
     return SimpleNamespace(done=done, heard=heard)
 
 
@@ -201,6 +201,19 @@ def test_what_the_axis_leaves_open_is_in_every_sigma(geometry: dict[str, Any]) -
     exact = conclude(Views(views=tuple(views(0, 1))), recipe(), ticks(), lambda step: None)
     geometry["refine_axis"] = agreed(surface_mm=0.02)
     done = conclude(Views(views=tuple(views(0, 1))), recipe(), ticks(), lambda step: None)
+    assert done.merge_mm == 0.02
+    check_wider(exact, done)
+
+
+def test_what_merging_elsewhere_left_open_is_as_the_plan_says(geometry: dict[str, Any]) -> None:
+    stated = plan(measurement={"sigma_mm": 0.015, "merge_mm": 0.02})
+    exact, done = measured().done, measured(plan=stated).done
+    assert (exact.merge_mm, done.merge_mm) == (None, 0.02)
+    check_wider(exact, done)
+
+
+def check_wider(exact: Any, done: Any) -> None:
+    """The same values, each sigma with 0.02 mm more."""
     for before, after in ((exact.form_mm, done.form_mm), *paired(exact.sections[0], done.sections[0])):
         assert isinstance(before, Measurand)
         assert isinstance(after, Measurand)
