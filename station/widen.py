@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 def widened(found: Measurement, merge_mm: float) -> Measurement:
     """The measurement with `merge_mm`, the standard uncertainty of a surface point, in each of its sigmas.
 
-    The views of two sides of a blade may be shifted against each other by as much: a length takes it whole,
-    an angle over half the chord, a volume over the skin that was lost.
+    An axis that is off lays every view as far off along its own direction of sight: a part swells or
+    shrinks. A length takes it whole, one across the section from both its ends, an angle over half the
+    chord, a volume over the skin that was lost.
     """
     return replace(
         found,
@@ -41,15 +42,19 @@ def wider(measured: Measured, more: float) -> Measured:
 
 
 def _section(section: Section, merge_mm: float) -> Section:
-    turn_deg = degrees(merge_mm / _half_chord_mm(section))
-    more = {"mm": merge_mm, "deg": turn_deg}
+    more = {"mm": merge_mm, "deg": degrees(merge_mm / _half_chord_mm(section))}
     return replace(
         section,
         measurands={
-            name: wider(each, more.get(each.unit, 0.0)) if isinstance(each, Measurand) else each
+            name: wider(each, _ends(name) * more.get(each.unit, 0.0)) if isinstance(each, Measurand) else each
             for name, each in section.measurands.items()
         },
     )
+
+
+def _ends(name: str) -> float:
+    """Of how many places on the skin a measurand is the distance: chords and thicknesses have two."""
+    return 2.0 if "chord" in name or ("thickness" in name and "position" not in name) else 1.0
 
 
 def _half_chord_mm(section: Section) -> float:
@@ -80,7 +85,7 @@ def _damage(damage: Damage, merge_mm: float) -> Damage:
     return replace(
         damage,
         depth_mm=wider(damage.depth_mm, merge_mm),
-        remaining_chord_mm=wider(damage.remaining_chord_mm, merge_mm),
+        remaining_chord_mm=wider(damage.remaining_chord_mm, 2.0 * merge_mm),
         volume_mm3=wider(damage.volume_mm3, _volume_mm3(damage.area_mm2, merge_mm)),
     )
 
