@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
+from geometry.damage.depth import DEEP
 from geometry.damage.regions import Field, Region
 from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin
@@ -22,10 +23,10 @@ def normal_depth(region: Region, found: Field, nominal: Nominal, twin: Twin) -> 
     """
     height_mm = _heights(region, found, nominal, twin)
     near = found.neighbours[region.points]
-    mean_mm = np.ma.masked_array(height_mm[near], near < 0).mean(axis=1)
-    deepest = region.points[int(np.argmax(np.abs(mean_mm)))]
-    around = found.neighbours[deepest]
-    around = around[around >= 0]
+    of_it = (near >= 0) & np.isfinite(height_mm[near])
+    mean_mm = np.ma.masked_array(height_mm[near], ~of_it).mean(axis=1).filled(0.0)
+    place = int(np.argmax(np.abs(mean_mm)))
+    deepest, around = region.points[place], near[place][of_it[place]]
     off_mm = found.scan_mm[around] - found.scan_mm[deepest]
     across, along = np.linalg.eigh(off_mm.T @ off_mm)[1][:, :0:-1].T
     depth_mm = np.abs(height_mm[around])
@@ -38,12 +39,17 @@ def normal_depth(region: Region, found: Field, nominal: Nominal, twin: Twin) -> 
 def _heights(region: Region, found: Field, nominal: Nominal, twin: Twin) -> Floats:
     """Signed distances (n,) of the scan points to the twin, those of a break to the skin that it has lost.
 
-    Where both sides are gone that is the farther one: a hole is as deep as the metal is thick.
+    Where both sides are gone that is the farther one: a hole is as deep as the metal is thick. Of sound skin
+    under lost skin, on the other side of the metal, there is none: NaN.
     """
     if not (region.missing and len(region.lost)):
         return found.height_mm
     height_mm = found.height_mm.copy()
-    points_mm = found.scan_mm[region.points]
+    about = np.unique(found.neighbours[region.points])
+    about = about[about >= 0]
+    points_mm, clear_mm = found.scan_mm[about], DEEP * found.noise_mm
+    inside = np.isin(about, region.points)
+    broken = inside & (np.abs(found.height_mm[about]) > clear_mm)
     face, sample = _faces_over(region.lost, found, twin)
     for side in _sides(region.lost, nominal):
         own = face[np.isin(sample, side)]
@@ -51,9 +57,10 @@ def _heights(region: Region, found: Field, nominal: Nominal, twin: Twin) -> Floa
             continue
         skin = Skin(Mesh(vertices_mm=twin.mesh.vertices_mm, faces=twin.mesh.faces[own]))
         apart_mm, feet_mm, foot = skin.closest(points_mm)
-        if np.abs(apart_mm).min() <= BORDERING * found.spacing_mm:  # else it was not seen
+        if np.abs(apart_mm[inside]).min() <= BORDERING * found.spacing_mm:  # else it was not seen
             inward_mm = ((points_mm - feet_mm) * skin.normals[foot]).sum(axis=1)
-            height_mm[region.points] = np.minimum(height_mm[region.points], inward_mm)
+            height_mm[about[broken]] = np.minimum(height_mm[about], inward_mm)[broken]
+            height_mm[about[~broken & (inward_mm < -clear_mm)]] = np.nan
     return height_mm
 
 
