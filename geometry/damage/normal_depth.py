@@ -4,13 +4,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
-from geometry.damage.depth import DEEP
 from geometry.damage.regions import Field, Region
 from geometry.damage.skin import Skin
 from geometry.deformation.twin import Twin
 from geometry.types import Floats, Ints, Measurand, Mesh
 
 BORDERING = 1.5  # spacings from lost skin within which its break begins
+ON_SKIN = 5.0  # sigmas of a point within which it lies on the twin: of many, none strays farther
+LEAST = 6  # neighbours of a place that tell how deep it is
 A_SIDE = 0.1  # of the lost skin that makes it a side of its own: metal that is gone from both is pierced
 
 
@@ -25,7 +26,7 @@ def normal_depth(region: Region, found: Field, nominal: Nominal, twin: Twin) -> 
     near = found.neighbours[region.points]
     of_it = (near >= 0) & np.isfinite(height_mm[near])
     mean_mm = np.ma.masked_array(height_mm[near], ~of_it).mean(axis=1).filled(0.0)
-    place = int(np.argmax(np.abs(mean_mm)))
+    place = int(np.argmax(np.abs(mean_mm) * (of_it.sum(axis=1) >= LEAST)))
     deepest, around = region.points[place], near[place][of_it[place]]
     off_mm = found.scan_mm[around] - found.scan_mm[deepest]
     across, along = np.linalg.eigh(off_mm.T @ off_mm)[1][:, :0:-1].T
@@ -47,7 +48,7 @@ def _heights(region: Region, found: Field, nominal: Nominal, twin: Twin) -> Floa
     height_mm = found.height_mm.copy()
     about = np.unique(found.neighbours[region.points])
     about = about[about >= 0]
-    points_mm, clear_mm = found.scan_mm[about], DEEP * found.noise_mm
+    points_mm, clear_mm = found.scan_mm[about], ON_SKIN * found.noise_mm
     inside = np.isin(about, region.points)
     broken = inside & (np.abs(found.height_mm[about]) > clear_mm)
     face, sample = _faces_over(region.lost, found, twin)

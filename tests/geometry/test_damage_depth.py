@@ -104,6 +104,19 @@ def test_a_pit_is_as_deep_as_it_was_cut_where_the_other_side_is_nearer(per_mm2: 
     assert depth.value == pytest.approx(DEEP_MM, abs=3.0 * depth.sigma + 0.02)
 
 
+@pytest.mark.parametrize("left_mm", [0.4, 0.25, 0.15])
+def test_skin_close_under_a_pit_takes_nothing_from_its_depth(left_mm: float) -> None:
+    """Where hardly any metal is left, points of its other side are among the neighbours of the bottom."""
+    depth_mm = thickness_mm() - left_mm
+    cutters = {Zone.SURFACE: blades.pit_cutter(depth_mm, 3.5)}
+    scanned = blades.specimen(cutters, NOISE_MM, np.random.default_rng(0), 25.0)
+    mask = scanned.on_break >= 0
+    (damage,) = find_damages(scanned.cloud, mask, scanned.alignment, nominal(), scanned.twin)
+    depth = number(damage.depth_mm)
+    assert depth.value == pytest.approx(depth_mm, abs=3.0 * depth.sigma + 0.02)
+    assert depth.sigma < 0.05
+
+
 @pytest.mark.parametrize("per_mm2", [60.0, 25.0])
 def test_a_hole_is_as_deep_as_the_metal_is_thick(per_mm2: float) -> None:
     assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thickness_mm(), rel=0.06)
