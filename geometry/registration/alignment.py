@@ -53,7 +53,6 @@ def pose_covariance(alignment: Alignment) -> Floats:
 
 
 def variance_along(alignment: Alignment, point_mm: Floats, normal: Floats) -> float:
-    """Variance (mm^2) from point noise of the pose at a point (3,) along a normal (3,), nominal frame."""
+    """Variance (mm^2) of the pose from the best fit at a point (3,) along a normal (3,), nominal frame."""
     lever = np.concatenate([np.cross(point_mm - alignment.pivot_mm, normal), normal])
-    covariance = np.linalg.pinv(alignment.information, rcond=1e-14, hermitian=True)
-    return max(float(lever @ covariance @ lever), 0.0)
+    return float(lever @ pose_covariance(alignment) @ lever)
