@@ -17,6 +17,7 @@ from simulators.solids import Floats, loop_area_mm2
 TOUCHING_POINTS = 900
 CIRCLE_STARTS = 3
 FIRST_STEP_MM = 0.02
+FINE_MM = 0.02
 
 
 def centroid_mm(curve_mm: Floats) -> Floats:
@@ -52,6 +53,7 @@ def max_thickness_mm(curve_mm: Floats) -> float:
     |q - p|^2 / (2 n.(q - p)); the smallest over q is the inscribed one. The best of these start a
     simplex search on the exact distance to the polygon's sides.
     """
+    curve_mm = finely(curve_mm)
     points = resampled(curve_mm, _perimeter_mm(curve_mm) / TOUCHING_POINTS)
     inward = -outward_normals(points)
     radii = _touching_radii(points, inward)
@@ -81,6 +83,21 @@ def _touching_radii(points: Floats, inward: Floats) -> Floats:
         radii = np.where(reach > 0.0, (to**2).sum(axis=2) / (2.0 * reach), np.inf)
     nearest: Floats = radii.min(axis=1)
     return nearest
+
+
+def finely(curve_mm: Floats) -> Floats:
+    """The same polygon with points along its sides, none farther than `FINE_MM` from the next.
+
+    Slices of meshes have sides so long that the corner next to a point need not belong to its nearest side.
+    """
+    sides = np.roll(curve_mm, -1, axis=0) - curve_mm
+    parts = np.maximum(np.ceil(np.linalg.norm(sides, axis=1) / FINE_MM).astype(np.int64), 1)
+    along = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    finer: Floats = (
+        np.repeat(curve_mm, parts, axis=0)
+        + np.repeat(sides, parts, axis=0) * (along / np.repeat(parts, parts))[:, None]
+    )
+    return finer
 
 
 def distance_to_curve_mm(curve_mm: Floats, points_mm: Floats, tree: cKDTree | None = None) -> Floats:
@@ -183,7 +200,7 @@ def compare(
     `le_mm` (2,) is a point near the leading edge.
     """
     shift = centroid_mm(actual_mm) - centroid_mm(nominal_mm)
-    deviation = signed_distance_mm(nominal_mm, actual_mm)
+    deviation = signed_distance_mm(finely(nominal_mm), actual_mm)
     return SectionTruth(
         z_mm=z_mm,
         position_x_mm=float(shift[0]),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from simulators.sections import (
     centroid_mm,
@@ -14,7 +15,7 @@ from simulators.sections import (
     signed_distance_mm,
     sizes,
 )
-from simulators.solids import Floats
+from simulators.solids import Floats, loop_area_mm2
 
 
 def ellipse(a: float, b: float, count: int = 4000) -> Floats:
@@ -45,6 +46,29 @@ def test_an_ellipse() -> None:
     assert centroid_mm(curve) == pytest.approx([3.0, -4.0], abs=1e-12)
     assert chord_mm(curve) == pytest.approx(40.0, abs=1e-4)
     assert max_thickness_mm(curve) == pytest.approx(5.0, abs=1e-5)
+
+
+def test_a_slice_with_long_sides_is_as_thick_as_its_polygon() -> None:
+    """Where a corner lies opposite the middle of a long side."""
+    wedge = np.array([[0.0, 0.0], [30.0, -1.5], [30.0, 1.5]])
+    assert max_thickness_mm(wedge) == pytest.approx(2.0 * _inscribed_radius(wedge), abs=1e-4)
+    coarse = np.array([[0.0, 0.0], [6.0, -1.0], [20.0, -1.2], [31.0, 0.0], [13.0, 1.3], [4.0, 0.9]])
+    assert max_thickness_mm(coarse) == pytest.approx(_widest_circle(coarse), abs=1e-3)
+
+
+def _inscribed_radius(triangle: Floats) -> float:
+    """Twice the area over the perimeter."""
+    around = np.linalg.norm(triangle - np.roll(triangle, 1, axis=0), axis=1).sum()
+    return 2.0 * abs(loop_area_mm2(triangle)) / float(around)
+
+
+def _widest_circle(polygon: Floats) -> float:
+    """Of a convex polygon, by the linear programme that pushes its sides inward alike."""
+    sides = np.roll(polygon, -1, axis=0) - polygon
+    outward = np.column_stack([sides[:, 1], -sides[:, 0]]) / np.linalg.norm(sides, axis=1)[:, None]
+    rows = np.column_stack([outward, np.ones(len(polygon))])
+    best = linprog([0.0, 0.0, -1.0], A_ub=rows, b_ub=(outward * polygon).sum(axis=1), bounds=(None, None))
+    return 2.0 * float(best.x[2])
 
 
 def test_the_sizes_of_a_wedge() -> None:
