@@ -37,7 +37,7 @@ class MaskSettings:
     ring: int = 5  # nearest neighbours of damage that are damage too
     shallow_mm: float = 0.02  # of a neighbourhood: a rim that is further off stays damage
     exact_mm: float = 0.004  # of a neighbourhood: no better is a form known
-    form_mm: float = 0.15  # smooth deviations up to this are form, not damage
+    form_mm: float = 0.06  # smooth deviations up to this are form, not damage
     rim_mm: float = 2.0  # around points that are further off, where a damage may run out ...
     usual: float = 1.0  # ... unless a point there is no further off than this share of the scatter
     form_points: int = 20_000  # of the cloud, to find them
