@@ -96,6 +96,15 @@ def test_a_thin_edge_has_a_form_too():
     assert np.sqrt(np.mean((form - moved)[normals[:, 0] > 0.0] ** 2)) < 0.008
 
 
+def test_what_a_thin_edge_has_lost_over_a_length_is_no_form():
+    """Eroded by 0.14 over a fifth of its length, on a plate that is hardly worn."""
+    rng = np.random.default_rng(7)
+    points, normals = blunt_plate(rng)
+    lost = 0.14 * np.clip(9.0 - np.abs(points[:, 2] - 40.0), 0.0, 1.0) * np.maximum(normals[:, 0], 0.0)
+    form = form_of(points, normals, -lost + rng.normal(scale=0.01, size=len(points)), MaskSettings())
+    assert np.abs(form[lost > 0.1]).mean() < 0.04
+
+
 def test_form_of_a_surface_that_is_nowhere_near_is_nothing():
     points, normals = wedge(np.random.default_rng(6))
     far = np.where(np.arange(len(points)) % 2, 3.0, -3.0)
