@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from geometry.registration.alignment import pose_covariance
 from geometry.types import Measurand, Measured, NotMeasured
 from station.software import software_commit, software_version
 
@@ -102,6 +103,7 @@ def values_of(measured: Mapping[str, Measured]) -> Json:
 def alignment_of(alignment: Alignment | None) -> Json | None:
     if alignment is None:
         return None
+    sigma = np.sqrt(np.diag(pose_covariance(alignment)))
     return {
         "method": alignment.method,
         "T_nominal_scan": alignment.T_nominal_scan.tolist(),
@@ -109,6 +111,8 @@ def alignment_of(alignment: Alignment | None) -> Json | None:
         "information": alignment.information.tolist(),
         "form_covariance": alignment.form_covariance.tolist(),
         "unseen_covariance": alignment.unseen_covariance.tolist(),
+        "sigma_deg": np.rad2deg(sigma[:3]).tolist(),
+        "sigma_mm": sigma[3:].tolist(),
         "rms_mm": alignment.rms_mm,
         "noise_mm": alignment.noise_mm,
         "inlier_fraction": alignment.inlier_fraction,

@@ -197,6 +197,13 @@ def test_a_pose_without_a_rival_has_no_ratio() -> None:
     assert written(measurement(alignment=alignment(runner_up_ratio=float("inf"))))["alignment"]["converged"]
 
 
+def test_the_pose_is_stated_with_what_noise_and_the_unseen_leave_open() -> None:
+    noise, unseen = np.diag([1e8] * 3 + [1e4] * 3), np.diag([0.0] * 5 + [3e-4])
+    found = written(measurement(alignment=alignment(information=noise, unseen_covariance=unseen)))
+    assert found["alignment"]["sigma_deg"] == pytest.approx([np.rad2deg(1e-4)] * 3, rel=1e-3)
+    assert found["alignment"]["sigma_mm"] == pytest.approx([0.01, 0.01, 0.02], rel=1e-3)
+
+
 # The folder
 
 
