@@ -37,7 +37,8 @@ class MaskSettings:
     ring: int = 5  # nearest neighbours of damage that are damage too
     shallow_mm: float = 0.02  # of a neighbourhood: a rim that is further off stays damage
     exact_mm: float = 0.004  # of a neighbourhood: no better is a form known
-    form_mm: float = 0.06  # smooth deviations up to this are form, not damage
+    form_mm: float = 0.06  # smooth deviations of walls up to this are form, not damage
+    end_form_mm: float = 0.15  # and of end faces, whose few points the scatter of all says little of
     rim_mm: float = 2.0  # around points that are further off, where a damage may run out ...
     usual: float = 1.0  # ... unless a point there is no further off than this share of the scatter
     form_points: int = 20_000  # of the cloud, to find them
@@ -49,8 +50,8 @@ class MaskSettings:
             raise BadInput(f"mask: {self} contradicts itself")
         if not (min(self.own, self.shallow_mm) > 0.0 and self.exact_mm >= 0.0 and self.ring >= 0):
             raise BadInput(f"mask: {self} has no rim")
-        if not (self.form_mm > 0.0 and self.rim_mm >= 0.0 and self.usual >= 0.0):
-            raise BadInput(f"mask: form {self.form_mm} mm and rim {self.rim_mm} mm are no distances")
+        if not (min(self.form_mm, self.end_form_mm) > 0.0 and min(self.rim_mm, self.usual) >= 0.0):
+            raise BadInput(f"mask: {self} has a distance that is none")
         if not 20 <= self.form_window <= self.form_nodes <= self.form_points:
             raise BadInput(f"mask: {self} has too few points for a form")
 
@@ -84,15 +85,16 @@ def form_of(points_mm: Floats, normals: Floats, distance_mm: Floats, settings: M
     """The smooth part (n,) of the signed distances: what service or making did to the form.
 
     Local fits over a few millimetres, robust against what is abrupt, blended between their nodes. Points
-    further than `form_mm` off, or four robust sigmas of all, take no part, nor do those next to them: within
-    a wide damage the form is that of its surroundings. But a break is sharp, and the form runs up to it: what
-    lies there as near the nominal as most points do tells it. Where a bent blade leaves the nominal smoothly
-    by more, the fits reach out until no more points join.
+    further than `form_mm` or `end_form_mm` off, or four robust sigmas of all, take no part, nor do those next
+    to them: within a wide damage the form is that of its surroundings. But a break is sharp, and the form
+    runs up to it: what lies there as near the nominal as most points do tells it. Where a bent blade leaves
+    the nominal smoothly by more, the fits reach out until no more points join.
     """
     place = np.column_stack([points_mm, TURN_MM * normals])
     few = _sampled(place, normals, settings)
     off_mm, scatter_mm = np.abs(distance_mm[few]), robust_sigma(distance_mm)
-    limit_mm = max(settings.form_mm, 4.0 * scatter_mm)
+    ends = of_end_faces(normals[few])
+    limit_mm = np.maximum(np.where(ends, settings.end_form_mm, settings.form_mm), 4.0 * scatter_mm)
     near = off_mm <= limit_mm
     for _ in range(REACHES):
         beside = next_to(place[few], ~near, settings.rim_mm) & (off_mm > settings.usual * scatter_mm)
