@@ -9,6 +9,7 @@ from geometry.registration.fit import unit_motions
 from geometry.types import Floats
 
 FREE = 1e-9  # eigenvalue a point below which no number would be left
+NO_POINT = 1e-9  # counts for so much, where there is none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,4 +39,4 @@ def free_inverse(information: Floats, scale: Floats) -> Floats:
 def root_inverse(normal_matrix: Floats, points: float) -> Floats:
     """The inverse root (6, 6) of a normal matrix of so many points; free motions get a huge, finite one."""
     values, vectors = np.linalg.eigh(normal_matrix)
-    return np.asarray((vectors / np.sqrt(np.maximum(values, FREE * points))) @ vectors.T)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, FREE * max(points, NO_POINT)))) @ vectors.T)

@@ -7,7 +7,7 @@ import pytest
 
 from geometry.blade.nominal import NominalSettings, prepare_nominal
 from geometry.registration.fit import Fit, fit_kept, information
-from geometry.registration.form_effect import form_effect, required
+from geometry.registration.form_effect import Surface, form_effect, required
 from geometry.registration.uncertainty import certainty
 from geometry.transforms import apply, log
 from tests.geometry import blades
@@ -128,6 +128,14 @@ def test_nothing_is_unseen_where_all_is_seen():
     form = smooth_form(feet.points_mm, feet.normals, rng)
     _, _, effect = fitted_to(feet, form + rng.normal(scale=SIGMA_MM, size=len(form)))
     assert np.trace(effect.unseen) < 0.01 * np.trace(effect.form)
+
+
+def test_a_zone_of_which_nothing_can_be_seen_leaves_finite_numbers():
+    feet = exact()
+    nothing = Surface(points_mm=np.zeros((0, 3)), normals=np.zeros((0, 3)), shares=np.zeros(0))
+    effect = form_effect(nominal(), feet.points_mm, feet, np.ones(len(feet.face)), nothing)
+    assert np.isfinite(effect.unseen).all()
+    assert np.isfinite(effect.form).all()
 
 
 @pytest.mark.parametrize("waves", [3, 6, 12])
