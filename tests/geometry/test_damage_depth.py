@@ -82,7 +82,9 @@ def thickness_mm() -> float:
 def truth(name: str) -> float:
     if name == "tip corner":
         return blades.SPAN_MM - float(blades.mesh_of(lost(name)).vertices_mm[:, 2].min())
-    return edge_truth()[0] if name == "edge nick" else 1.2
+    if name == "edge nick":
+        return edge_truth()[0]
+    return {"pit": 1.2, "deep pit": DEEP_MM, "hole": thickness_mm()}[name]
 
 
 @pytest.mark.parametrize("name", ["tip corner", "edge nick", "pit"])
