@@ -200,7 +200,7 @@ def compare(
     `le_mm` (2,) is a point near the leading edge.
     """
     shift = centroid_mm(actual_mm) - centroid_mm(nominal_mm)
-    deviation = signed_distance_mm(finely(nominal_mm), actual_mm)
+    deviation = signed_distance_mm(nominal_mm, actual_mm)
     return SectionTruth(
         z_mm=z_mm,
         position_x_mm=float(shift[0]),
@@ -215,6 +215,7 @@ def compare(
 
 def signed_distance_mm(curve_mm: Floats, points_mm: Floats) -> Floats:
     """The distance (n,) of points (n, 2) near a smooth closed curve, positive outside."""
+    curve_mm = finely(curve_mm)
     tree = cKDTree(curve_mm)
     nearest = tree.query(points_mm)[1]
     across = ((points_mm - curve_mm[nearest]) * outward_normals(curve_mm)[nearest]).sum(axis=1)

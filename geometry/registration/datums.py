@@ -25,7 +25,7 @@ from geometry.registration.form_effect import Surface, form_effect
 from geometry.registration.register import RegisterSettings, mask_damage, neighbours_of
 from geometry.registration.uncertainty import certainty
 from geometry.robust import TUKEY, robust_sigma
-from geometry.scan.neighbourhood import surface_shares
+from geometry.scan.neighbourhood import Neighboured, surface_shares
 from geometry.threads import one_blas_thread
 from geometry.transforms import apply, exp, inverse, log
 from geometry.types import Bools, Cloud, Floats, Measurand, Unit
@@ -109,7 +109,9 @@ def _register_bands(
     few_mm = cloud.points_mm[chosen[every(len(chosen), settings.register.robust_points)]]
     robust = fit_robust(few_mm, start.T_nominal_scan, nominal)
     fit = replace(robust, found=nominal.closest(apply(robust.T_nominal_scan, cloud.points_mm)))
-    shares = surface_shares(cloud.points_mm, neighbours_of(cloud, settings.register))
+    nearest = neighbours_of(cloud, settings.register)  # once: each round's mask goes by them, too
+    cloud = Neighboured(points_mm=cloud.points_mm, sigma_mm=cloud.sigma_mm, view=cloud.view, nearest=nearest)
+    shares = surface_shares(cloud.points_mm, nearest)
     turns = robust.iterations
     for _ in range(settings.register.rounds):
         here = replace(start, T_nominal_scan=fit.T_nominal_scan)
@@ -118,9 +120,9 @@ def _register_bands(
         kept = sound & _inside(fit.found.points_mm[:, 2], bands, 0.0)
         fit = fit_kept(cloud.points_mm, fit, kept * shares, nominal)
         turns += fit.iterations
-    share = float(kept.sum() / _inside(fit.found.points_mm[:, 2], bands, 0.0).sum())
+    inliers = float(kept.sum() / _inside(fit.found.points_mm[:, 2], bands, 0.0).sum())
     fit, whole = replace(fit, iterations=turns), _surface(nominal, bands)
-    return _alignment(cloud, nominal, start, fit, kept * shares, whole, share, method, settings)
+    return _alignment(cloud, nominal, start, fit, kept * shares, whole, inliers, method, settings)
 
 
 def _surface(nominal: Nominal, bands: Sequence[tuple[float, float]]) -> Surface:
@@ -140,7 +142,7 @@ def _alignment(
     fit: Fit,
     shares: Floats,
     whole: Surface,
-    sound: float,
+    inliers: float,
     method: str,
     settings: DatumSettings,
 ) -> Alignment:
@@ -163,7 +165,7 @@ def _alignment(
         weak_directions=loose if len(loose) > len(fit.weak) else fit.weak,
         rms_mm=float(np.sqrt(np.mean(found.distance_mm**2))),
         noise_mm=robust_sigma(found.distance_mm),
-        inlier_fraction=sound,
+        inlier_fraction=inliers,
         iterations=fit.iterations,
         converged=fit.converged,
     )

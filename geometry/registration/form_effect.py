@@ -71,32 +71,35 @@ def form_effect(
     """
     few, whole = _few_of(found.normals), whole.of(_few_of(whole.normals))
     seen = Surface(points_mm=found.points_mm, normals=found.normals, shares=shares).of(few)
-    root, scale = np.sqrt(seen.shares), unit_motions(nominal)
-    design = root[:, None] * motions(moved_mm[few.chosen], seen.normals, nominal.pivot_mm) * scale
-    whiten = root_inverse(design.T @ design, float(seen.shares.sum()))
-    pose = design @ whiten
+    design, whiten = _fit_of(nominal, moved_mm[few.chosen], seen)
+    pose, root = design @ whiten, np.sqrt(seen.shares)
     off_mm = root * found.distance_mm[few.chosen]
     left_mm = off_mm - pose @ (pose.T @ off_mm)
-    waves = _waves_of(nominal, seen)
+    waves = _waves_of(seen)
     pairs = zip(_patterns(nominal, seen, waves), _patterns(nominal, whole, waves), strict=True)
-    of_whole = _pose_of(nominal, whole, whiten)
+    of_whole = _pose_of(nominal, whole) @ np.linalg.inv(whiten)
     families = [_family(left_mm, pose, here, of_whole, everywhere) for here, everywhere in pairs]
     noise_mm2 = _noise_mm2(families)
     form, unseen = np.sum([family.leaked(noise_mm2) for family in families], axis=0)
     bulge = pose.T @ (root * nominal.bulge_mm[found.face[few.chosen]])
-    back = whiten * scale[:, None]
+    back = whiten * unit_motions(nominal)[:, None]
     return FormEffect(
         form=np.asarray(back @ (form + np.outer(bulge, bulge)) @ back.T),
         unseen=np.asarray(back @ unseen @ back.T),
     )
 
 
-def _pose_of(nominal: Nominal, surface: Surface, whiten: Floats) -> Floats:
-    """What each point (n, 6) of a surface would give to its own least-squares pose, in whitened motions."""
-    rows = motions(surface.points_mm, surface.normals, nominal.pivot_mm) * unit_motions(nominal)
-    weighted = rows * np.sqrt(surface.shares)[:, None]
-    root = root_inverse(weighted.T @ weighted, float(surface.shares.sum()))
-    return np.asarray(weighted @ root @ root @ np.linalg.inv(whiten))
+def _fit_of(nominal: Nominal, points_mm: Floats, surface: Surface) -> tuple[Floats, Floats]:
+    """Weighted unit motions (n, 6) of points over a surface, and the inverse root (6, 6) of their squares."""
+    rows = motions(points_mm, surface.normals, nominal.pivot_mm) * unit_motions(nominal)
+    design = rows * np.sqrt(surface.shares)[:, None]
+    return design, root_inverse(design.T @ design, float(surface.shares.sum()))
+
+
+def _pose_of(nominal: Nominal, surface: Surface) -> Floats:
+    """What each point (n, 6) of a surface would give to its own least-squares pose, in unit motions."""
+    design, root = _fit_of(nominal, surface.points_mm, surface)
+    return np.asarray(design @ root @ root)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,7 +130,7 @@ class Waves:
     on_ends: int  # 0: no end face was seen
 
 
-def _waves_of(nominal: Nominal, seen: Surface) -> Waves:
+def _waves_of(seen: Surface) -> Waves:
     z_mm, ends = seen.points_mm[:, 2], int(of_end_faces(seen.normals).sum())
     return Waves(
         low_mm=float(z_mm.min()),
