@@ -21,7 +21,8 @@ LIT = 5  # points on a face beyond a rim that make it seen ...
 INWARD_MM = 0.3  # ... so far from it: nearer to it lie feet of a wall that slid past its end, too
 SHARE = 0.05  # of the points that a tip face would have, below which it is not seen
 BLURS_MM = np.geomspace(5e-4, 0.4, 14)  # of an end ...
-BLUNTEST_MM = 0.08  # ... beyond which it is ragged
+BLUNTEST_MM = 0.08  # ... beyond which it is ragged ...
+DOUBT = 1.0  # ... if that is clearly likelier: by so much, in logarithms
 LEVEL_MM = 0.01  # of a rim that is an end at one height
 CHANCE = 4.0  # sigmas within which two ends are as far apart as the nominal's
 
@@ -149,7 +150,7 @@ def _wall(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nom
     if len(wall) < LEAST or _seen(wall, found, nominal) >= LIT:
         return None
     stops_mm, misfits = _likeliest(past_mm[wall])
-    if not BLURS_MM[np.argmin(misfits)] < BLUNTEST_MM:
+    if misfits[BLURS_MM < BLUNTEST_MM].min() > misfits.min() + DOUBT:
         return None
     return _Wall(
         points=len(wall),
