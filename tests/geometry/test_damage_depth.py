@@ -124,6 +124,40 @@ def test_a_hole_is_as_deep_as_the_metal_is_thick(per_mm2: float) -> None:
     assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thickness_mm(), rel=0.06)
 
 
+@pytest.mark.parametrize("per_mm2", [3.0, 2.0])
+def test_a_hole_too_small_for_a_thin_scan_is_no_shallow_pit(per_mm2: float) -> None:
+    """No skin about it counts as lost: points of its wall are nearest to either side of the metal."""
+    assert isinstance(one("hole", per_mm2, 0).depth_mm, NotMeasured)
+    assert isinstance(one("deep pit", per_mm2, 0).depth_mm, Measurand)
+
+
+@pytest.mark.parametrize(("depth_mm", "radius_mm"), [(0.15, 1.0), (0.15, 2.0), (0.6, 2.0)])
+def test_noise_makes_no_bottom_deeper(depth_mm: float, radius_mm: float) -> None:
+    """The deepest of few noisy points would be: by a sigma of theirs."""
+    ball_mm = (radius_mm**2 + depth_mm**2) / (2.0 * depth_mm)
+    depths = [shallow(blades.pit_cutter(depth_mm, ball_mm), seed) for seed in range(8)]
+    errors_mm = np.array([depth.value - depth_mm for depth in depths])
+    assert abs(errors_mm.mean()) < 0.004
+    assert np.sqrt(np.mean(errors_mm**2)) < 0.007
+    assert max(depth.sigma for depth in depths) < 0.025
+
+
+def test_a_pointed_bottom_is_as_deep_as_it_is_told_within_its_uncertainty() -> None:
+    at_mm, normal = blades.pressure_side_at(0.45, 0.55 * blades.SPAN_MM)
+    cone = manifold3d.Manifold.cylinder(0.6, 0.0, 2.0, 160, False)
+    place = np.column_stack([blades.frame_with_z(normal), at_mm - 0.3 * normal])
+    for seed in range(6):
+        depth = shallow(cone.transform(place), seed)
+        assert depth.value == pytest.approx(0.3, abs=2.5 * depth.sigma)
+        assert depth.sigma < 0.05
+
+
+def shallow(cutter: manifold3d.Manifold, seed: int) -> Measurand:
+    scanned = blades.specimen({Zone.SURFACE: cutter}, NOISE_MM, np.random.default_rng(seed), 60.0)
+    (damage,) = find_damages(scanned.cloud, scanned.on_break >= 0, scanned.alignment, nominal(), scanned.twin)
+    return number(damage.depth_mm)
+
+
 @pytest.mark.parametrize(("share", "depth_mm"), [(0.8, 0.6), (0.85, 0.5), (0.9, 0.4)])
 @pytest.mark.parametrize("seen", [True, False])
 def test_a_pit_beside_an_edge_that_is_whole_is_as_deep_as_on_a_side(
