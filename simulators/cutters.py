@@ -10,14 +10,16 @@ from typing import Literal
 
 import numpy as np
 
-from simulators.airfoils import Airfoil
+from simulators.airfoils import Airfoil, airfoil_loop
 from simulators.solids import Floats, Ints, Solid
 
 ZoneName = Literal["tip", "leading_edge", "trailing_edge", "surface"]
 EdgeName = Literal["leading_edge", "trailing_edge"]
 Relief = Callable[[Floats, Floats], Floats]  # (u, v) -> how far inward the fracture lies
 WAVES = 9  # of a rough surface
-BLUNT = 0.045  # radius of an eroded edge, of the chord
+BLUNT = 0.045  # radius of an eroded edge, of the chord ...
+FLAT = 2.0  # the same, of one that is as good as flat
+WIDE = 0.1  # ... and how far it may reach to either side, of the chord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,19 +124,16 @@ def eroded_edge(
 ) -> Cut:
     """An edge worn back between two fractions of the span by about `depth_mm`, left blunt and rounded.
 
-    It runs out at both ends, and on both sides into the skin.
+    It runs out at both ends, and on both sides into the skin: the blunter, the thicker the edge.
     """
     z_mm = np.linspace(airfoil.height_mm(span_fractions[0]), airfoil.height_mm(span_fractions[1]), 241)
     edge, outward = (np.array(rows) for rows in zip(*(_edge(airfoil, zone, z) for z in z_mm), strict=True))
     across = np.column_stack([outward[:, 1], -outward[:, 0], np.zeros(len(z_mm))])
-    v_mm = np.linspace(-1.0, 1.0, 121) * 0.1 * airfoil.chord_mm
+    v_mm = np.linspace(-1.0, 1.0, 121) * WIDE * airfoil.chord_mm
+    radius_mm = _blunt_mm(airfoil, zone, float(z_mm[len(z_mm) // 2]), depth_mm)
     t, v = np.meshgrid(np.linspace(-1.0, 1.0, len(z_mm)), v_mm, indexing="ij")
     rough = _roughness(rng, 0.04 * depth_mm, 0.1 * airfoil.span_mm)
-    worn = (
-        depth_mm * (1.0 - 1.2 * t**4)
-        + v**2 / (2.0 * BLUNT * airfoil.chord_mm)
-        + rough(z_mm[:, None] + 0.0 * v, v)
-    )
+    worn = depth_mm * (1.0 - 1.2 * t**4) + v**2 / (2.0 * radius_mm) + rough(z_mm[:, None] + 0.0 * v, v)
     flat = edge[:, None] + v[..., None] * across[:, None]
     return Cut(
         zone=zone,
@@ -143,6 +142,21 @@ def eroded_edge(
             flat + 0.1 * airfoil.chord_mm * outward[:, None],
         ),
     )
+
+
+def _blunt_mm(airfoil: Airfoil, zone: EdgeName, z_mm: float, depth_mm: float) -> float:
+    """The least radius of an edge worn back by `depth_mm` that leaves the skin on both sides: no undercut."""
+    edge, outward = _edge(airfoil, zone, z_mm)
+    off = airfoil_loop(airfoil.solid, z_mm) - edge[:2]
+    off = np.roll(off, -int(np.argmin(np.linalg.norm(off, axis=1))), axis=0)
+    radius_mm = BLUNT * airfoil.chord_mm
+    for flank in (off, off[::-1]):
+        behind, aside = -flank @ outward[:2], flank @ np.array([outward[1], -outward[0]])
+        beside = np.cumsum(np.abs(aside) > 0.9 * WIDE * airfoil.chord_mm) == 0
+        cut = beside & (behind > 1.1 * depth_mm)
+        radii_mm = aside[cut] ** 2 / (2.0 * (behind[cut] - depth_mm))
+        radius_mm = max(radius_mm, 1.2 * float(radii_mm.min(initial=FLAT * airfoil.chord_mm)))
+    return radius_mm
 
 
 def pit(

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from skimage.measure import points_in_poly
 
 from simulators.airfoils import Airfoil, find_airfoil
 from simulators.blade import BladeShape, blade_solid
@@ -107,6 +108,27 @@ def test_an_eroded_edge_goes_back_evenly_and_runs_out_at_both_ends(zone: str, si
     assert truth.depth_mm == pytest.approx(lost.max(), abs=0.03)
     assert np.abs(np.diff(lost)).max() < 0.15
     assert truth.z_high_mm - truth.z_low_mm == pytest.approx(0.58 * (LENGTH_MM - 3.0), abs=1.5)
+
+
+def fat_surface(theta: Floats, z_mm: Floats) -> Floats:
+    """A thick nose that dives: its upper side rises as fast as it goes back."""
+    x = -HALF_CHORD_MM * np.cos(theta)
+    y = -3.0 * np.sin(theta) * (1.0 + 0.3 * np.cos(theta)) + 0.02 * (HALF_CHORD_MM**2 - x**2)
+    return np.stack(np.broadcast_arrays(x, y, z_mm), axis=-1)
+
+
+@pytest.mark.parametrize("depth_mm", [0.3, 0.8])
+def test_an_eroded_edge_has_no_undercut_however_thick_it_is(depth_mm: float) -> None:
+    solid = blade_solid(BladeShape(span_mm=LENGTH_MM), fat_surface, around=240, along=61)
+    airfoil = find_airfoil(solid, 3.0)
+    after, _ = break_off(airfoil, [eroded_edge(airfoil, "leading_edge", (0.2, 0.8), depth_mm, rng())])
+    le, te = airfoil.edge_points_mm(30.0)
+    outward = (le - te)[:2] / np.linalg.norm(le - te)
+    left = slice_loops(after, 30.0)[0]
+    worn = left[cKDTree(slice_loops(airfoil.solid, 30.0)[0]).query(left)[0] > 0.05]
+    assert len(worn) > 10
+    for step_mm in (0.1, 0.3, 1.0, 2.0):
+        assert not points_in_poly(worn + step_mm * outward, left).any()
 
 
 @pytest.mark.parametrize(("depth_mm", "radius_mm"), [(0.8, 2.5), (0.15, 1.0), (0.1, 2.0)])
