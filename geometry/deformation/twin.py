@@ -29,7 +29,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints, Measured, Mesh
 
 LOOSE_ROUNDS = 2  # at first more stands out than damage: form that the field has not taken up yet
-SETTLED = 0.999  # of the sound points stay where they are
+SETTLED = 0.995  # of the sound points stay where they are
 HELD = 0.2  # of the usual number of points makes a place trusted
 EVERY = 2  # a round fits every other place
 RIPPLE_CELLS = 0.5  # of the lattice, over which ripple is alike

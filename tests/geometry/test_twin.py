@@ -241,6 +241,7 @@ def test_a_real_blade_with_platform_and_root() -> None:
     [
         (0.0, 0.0, True),
         (0.0005, 0.011, True),
+        (0.003, 0.011, True),
         (0.0005, 0.05, False),
         (0.01, 0.011, False),
         (1.0, 0.005, True),
