@@ -26,6 +26,7 @@ from geometry.types import Bools, Cloud, Floats, Measurand, Measured, Mesh, NotM
 NEAR_MM = 2.0  # about a patch, where its vertices of the twin are sought
 REACHES = ((0.25, 0.25), (0.5, 0.5), (0.5, 1.25))  # of the permitted gap: about scan points, about the break
 SLACK = 0.25  # of the permitted gap: sound skin may be nearer than the break by so much
+A_HANDFUL = 7.0  # points that would tell a volume to itself
 NOT_MEASURED = NotMeasured(reason="was not measured")
 
 
@@ -35,7 +36,7 @@ class RepairSettings:
 
     max_gap_mm: float = 1.5  # a larger hole in the broken surface is not bridged
     film_sigmas: float = 3.0  # closer than this to the twin, in sigmas of a scan point, is sound skin
-    min_points: int = 30  # on the broken surface
+    min_points: int = 12  # on the broken surface: a scrap of a torn tip has no more
     resolution: float = 60.0  # grid cells across the square root of the broken area
     max_nodes: int = 12_000_000
     sliver_fraction: float = 0.01  # pieces smaller than this share of the largest are dropped
@@ -255,7 +256,8 @@ def _volume_sigma(piece: Piece, from_twin_mm3: float, broken: BrokenSurface, dif
 
     The twin's error is taken as the same all over the lost skin; the noise of the scan points averages
     out; where the patch is thinner than the film its edge is a matter of chance; what the two methods
-    disagree by and what was dropped stand for the shape between the points.
+    disagree by and what was dropped stand for the shape between the points, and a share of it all where
+    only a handful tells that.
     """
     middle_mm, area_mm2 = piece.faces(piece.outer)
     from_noise = broken.sigma_mm * broken.area_mm2 / np.sqrt(len(broken.raw_mm))
@@ -263,4 +265,5 @@ def _volume_sigma(piece: Piece, from_twin_mm3: float, broken: BrokenSurface, dif
     to_break_mm, _ = cKDTree(broken_mm).query(middle_mm, distance_upper_bound=broken.film_mm)
     from_film = broken.film_mm * float(area_mm2[to_break_mm < broken.film_mm].sum()) / np.sqrt(12.0)
     from_shape = np.hypot(difference_mm3 / np.sqrt(12.0), piece.dropped_mm3 / np.sqrt(3.0))
-    return float(np.linalg.norm([from_twin_mm3, from_noise, from_film, from_shape]))
+    from_few = (A_HANDFUL / len(broken.raw_mm)) ** 2 * volume_mm3(piece.mesh)
+    return float(np.linalg.norm([from_twin_mm3, from_noise, from_film, from_shape, from_few]))

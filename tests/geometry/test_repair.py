@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import geometry.repair.patches as repair_module
-from geometry.blade.solid import solid_normals
+from geometry.blade.solid import check_solid, solid_normals
 from geometry.damage.damages import DamageKind
 from geometry.errors import BadInput
 from geometry.repair.patches import (
@@ -161,6 +161,19 @@ def test_noise_at_the_rim_makes_no_break_deeper() -> None:
         (patch,) = repairs_of(specimen).patches
         errors.append(patch.volume_mm3.value / specimen.removed_mm3[0] - 1.0)
     assert abs(np.mean(errors)) <= 0.01
+
+
+def test_a_scrap_of_a_dozen_points_has_a_patch_and_says_how_little_it_knows() -> None:
+    ratios = []
+    for seed in range(8):
+        cutters = {Zone.SURFACE: blades.pit_cutter(0.2, 0.9)}
+        scan = blades.specimen(cutters, 0.012, np.random.default_rng(seed), 25.0)
+        found = find_repairs(scan.twin, scan.cloud, scan.alignment, scan.damages, RepairSettings())
+        (patch,) = found.patches
+        check_solid(patch.mesh)
+        ratios.append((patch.volume_mm3.value - scan.removed_mm3[0]) / patch.volume_mm3.sigma)
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert max(np.abs(ratios)) < 2.5
 
 
 def test_no_damage_gives_no_patch() -> None:
