@@ -19,7 +19,6 @@ from simulators.solids import Floats, Ints, NotASolid, Solid, from_manifold, to_
 
 EDGE_SLICES = 41
 AT_ONCE = 40  # fracture points whose depth is computed
-A_SIDE = 0.05  # of the lost skin that makes it a side of its own: metal that is gone from both is pierced
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,20 +111,13 @@ def _edge_loss_mm(airfoil: Airfoil, zone: ZoneName, after: Solid, z_mm: float) -
 
 def _normal_depth_mm(skin_mm: Floats, fracture_mm: Floats) -> float:
     """From the lost skin (m, 3, 3), the distance of the fracture point that is farthest from it; where the
-    metal is pierced, from the skin of the side that is farther."""
-    return max(_depth_below_mm(side, fracture_mm) for side in _sides(skin_mm))
-
-
-def _sides(triangles_mm: Floats) -> list[Floats]:
-    """The triangles (m, 3, 3), those apart that look opposite ways, a few of them left out.
-
-    Islands of skin beside a rough rim belong to the side that they lie on.
-    """
-    cross = _cross(triangles_mm)
+    metal is pierced, from that of the side that has lost more: a hole is as deep as the metal is thick."""
+    cross = _cross(skin_mm)
     area = np.linalg.norm(cross, axis=1)
     axis = np.linalg.eigh((cross / np.maximum(area, 1e-300)[:, None]).T @ cross)[1][:, -1]
     above = cross @ axis > 0.0
-    return [triangles_mm[side] for side in (above, ~above) if area[side].sum() > A_SIDE * area.sum()]
+    larger = above if area[above].sum() >= area[~above].sum() else ~above
+    return _depth_below_mm(skin_mm[larger], fracture_mm)
 
 
 def _depth_below_mm(skin_mm: Floats, fracture_mm: Floats) -> float:

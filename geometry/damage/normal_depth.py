@@ -28,7 +28,8 @@ def normal_depth(region: Region, found: Field, nominal: Nominal, twin: Twin) -> 
 
     The mean over a neighbourhood tells where the bottom is, and flattens it; how deep it is tells the quadric
     through the points around. Through many of them it averages their noise; where the bottom is pointed it
-    would flatten that, too, and the quadric through the nearest ones counts.
+    would flatten that, too, and the quadric through the nearest ones counts. So near to the skin of the other
+    side that noise hides what lies between, it may have pierced the metal.
     """
     height_mm = _heights(region, found, nominal, twin)
     deepest, around = _deepest(height_mm, region, found)
@@ -42,8 +43,11 @@ def normal_depth(region: Region, found: Field, nominal: Nominal, twin: Twin) -> 
     more_mm = narrow.depth_mm - wide.depth_mm
     pointed = more_mm > POINTED * narrow.noise_mm
     bottom = narrow if pointed else wide
-    unsure_mm = [found.sigma_mm[deepest], bottom.noise_mm, UNTOLD * narrow.rise_mm, more_mm * pointed]
-    return Measurand(name="depth", value=bottom.depth_mm, sigma=float(np.linalg.norm(unsure_mm)), unit="mm")
+    left_mm = float(np.median(np.abs(found.height_mm[around])))
+    pierced = left_mm < min(2.0 * ON_SKIN * found.noise_mm, 0.5 * bottom.depth_mm)
+    unsure_mm = [bottom.noise_mm, UNTOLD * narrow.rise_mm, more_mm * pointed, 0.5 * left_mm * pierced]
+    sigma_mm = float(np.linalg.norm([found.sigma_mm[deepest], *unsure_mm]))
+    return Measurand(name="depth", value=bottom.depth_mm, sigma=sigma_mm, unit="mm")
 
 
 def _deepest(height_mm: Floats, region: Region, found: Field) -> tuple[int, Ints]:

@@ -119,6 +119,15 @@ def test_skin_close_under_a_pit_takes_nothing_from_its_depth(left_mm: float) -> 
     assert depth.sigma < 0.05
 
 
+@pytest.mark.parametrize("beyond_mm", [0.02, 0.1, 0.3])
+def test_a_pit_that_pierces_the_metal_may_be_as_deep_as_that_is_thick(beyond_mm: float) -> None:
+    """Its bottom ends at the skin of the other side, where noise hides how deep it still went."""
+    for seed in range(3):
+        depth = shallow(blades.pit_cutter(thickness_mm() + beyond_mm, 3.5), seed)
+        assert depth.value == pytest.approx(thickness_mm(), abs=2.5 * depth.sigma)
+        assert depth.sigma < 0.1
+
+
 @pytest.mark.parametrize("per_mm2", [60.0, 25.0])
 def test_a_hole_is_as_deep_as_the_metal_is_thick(per_mm2: float) -> None:
     assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thickness_mm(), rel=0.06)

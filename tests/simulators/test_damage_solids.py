@@ -153,6 +153,15 @@ def test_a_hole_is_as_deep_as_the_metal_is_thick() -> None:
     assert truth.depth_mm == pytest.approx(np.ptp(middle[:, 1]), rel=0.15)
 
 
+def test_a_pit_that_pierces_is_deep_from_the_side_that_it_came_from() -> None:
+    """From the small skin lost on the other side its wide wall is farther than the metal is thick."""
+    airfoil = prism()
+    _, (truth,) = break_off(airfoil, [pit(airfoil, 0.5, 0.5, 4.3, 5.0, rng())])
+    loop = slice_loops(airfoil.solid, 30.0)[0]
+    thickest = np.ptp(loop[np.abs(loop[:, 0]) < 0.3, 1])
+    assert truth.depth_mm == pytest.approx(thickest, abs=0.18)
+
+
 def test_equal_seeds_break_alike_and_others_do_not() -> None:
     airfoil = prism()
     made = [break_off(airfoil, [pit(airfoil, 0.5, 0.5, 0.8, 2.5, rng(seed))])[1][0] for seed in (3, 3, 4)]
