@@ -21,6 +21,7 @@ LIT = 5  # points on a face beyond a rim that make it seen ...
 INWARD_MM = 0.3  # ... so far from it: nearer to it lie feet of a wall that slid past its end, too
 SHARE = 0.05  # of the points that a tip face would have, below which it is not seen
 BLURS_MM = np.geomspace(5e-4, 0.4, 14)  # of an end ...
+SHARPEST = 0.5  # of the scatter of the wall's points: what pushes them off it blurs its end, too ...
 BLUNTEST_MM = 0.08  # ... beyond which it is ragged ...
 DOUBT = 1.0  # ... if that is clearly likelier: by so much, in logarithms
 LEVEL_MM = 0.01  # of a rim that is an end at one height
@@ -150,6 +151,8 @@ def _wall(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nom
     if len(wall) < LEAST or _seen(wall, found, nominal) >= LIT:
         return None
     stops_mm, misfits = _likeliest(past_mm[wall])
+    scatter_mm = robust_sigma(found.distance_mm[wall])
+    misfits[BLURS_MM < SHARPEST * scatter_mm] = np.inf
     if misfits[BLURS_MM < BLUNTEST_MM].min() > misfits.min() + DOUBT:
         return None
     return _Wall(
@@ -157,7 +160,7 @@ def _wall(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nom
         middle_mm=moved_mm[wall].mean(axis=0),
         height_mm=height_mm,
         outward=outward,
-        scatter_mm=robust_sigma(found.distance_mm[wall]),
+        scatter_mm=scatter_mm,
         stops_mm=stops_mm,
         misfits=misfits,
     )
