@@ -152,7 +152,7 @@ def _wall(rim: Rim, moved_mm: Floats, sound: Bools, found: Closest, nominal: Nom
         return None
     stops_mm, misfits = _likeliest(past_mm[wall])
     scatter_mm = robust_sigma(found.distance_mm[wall])
-    misfits[BLURS_MM < SHARPEST * scatter_mm] = np.inf
+    misfits[min(SHARPEST * scatter_mm, BLURS_MM[-1]) > BLURS_MM] = np.inf
     if misfits[BLURS_MM < BLUNTEST_MM].min() > misfits.min() + DOUBT:
         return None
     return _Wall(
