@@ -17,9 +17,9 @@ ZoneName = Literal["tip", "leading_edge", "trailing_edge", "surface"]
 EdgeName = Literal["leading_edge", "trailing_edge"]
 Relief = Callable[[Floats, Floats], Floats]  # (u, v) -> how far inward the fracture lies
 WAVES = 9  # of a rough surface
-BLUNT = 0.045  # radius of an eroded edge, of the chord ...
+BLUNT = 0.045  # radius of an eroded edge, of the chord, at least
 FLAT = 2.0  # the same, of one that is as good as flat
-WIDE = 0.1  # ... and how far it may reach to either side, of the chord
+WIDE = 0.1  # how far an eroded edge may reach to either side, of the chord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

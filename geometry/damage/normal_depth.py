@@ -33,6 +33,8 @@ def normal_depth(region: Region, found: Field, nominal: Nominal, twin: Twin) -> 
     """
     height_mm = _heights(region, found, nominal, twin)
     deepest, around = _deepest(height_mm, region, found)
+    if len(around) < LEAST:
+        return NotMeasured(reason=f"{len(around)} points tell how deep it is")
     if region.missing and not len(region.lost) and _midway(around, height_mm, found, twin):
         return NotMeasured(reason="the scan is too thin to tell from which side metal is missing")
     wider = _wider(around, deepest, region.points[np.isfinite(height_mm[region.points])], found)

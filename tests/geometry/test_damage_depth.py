@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.damage import normal_depth
 from geometry.damage.damages import Damage, find_damages
 from geometry.types import Measurand, Measured, NotMeasured, Zone
 from tests.geometry import repair_blades as blades
@@ -131,6 +132,16 @@ def test_a_pit_that_pierces_the_metal_may_be_as_deep_as_that_is_thick(beyond_mm:
 @pytest.mark.parametrize("per_mm2", [60.0, 25.0])
 def test_a_hole_is_as_deep_as_the_metal_is_thick(per_mm2: float) -> None:
     assert number(one("hole", per_mm2, 0).depth_mm).value == pytest.approx(thickness_mm(), rel=0.06)
+
+
+def test_a_break_whose_points_all_lie_on_the_far_skin_has_no_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        normal_depth, "_heights", lambda region, found, *_: np.full(len(found.scan_mm), np.nan)
+    )
+    scanned = blades.specimen({Zone.SURFACE: blades.pit_cutter()}, NOISE_MM, np.random.default_rng(0), 25.0)
+    mask = scanned.on_break >= 0
+    (damage,) = find_damages(scanned.cloud, mask, scanned.alignment, nominal(), scanned.twin)
+    assert damage.depth_mm == NotMeasured(reason="0 points tell how deep it is")
 
 
 @pytest.mark.parametrize("per_mm2", [3.0, 2.0])
