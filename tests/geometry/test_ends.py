@@ -101,6 +101,16 @@ def test_few_points_make_no_sharp_end_ragged():
     assert np.mean(both) >= 0.95
 
 
+def test_no_single_point_decides_where_a_scan_stops():
+    """Nearer to the last point than its noise no end is told: without that point both stay where they were."""
+    for seed in range(100, 120):
+        points_mm = open_scan(seed)
+        fewer_mm = np.delete(points_mm, np.argmax(points_mm[:, 2]), axis=0)
+        both = zip(ends_of(points_mm), ends_of(fewer_mm), strict=True)
+        moved_mm = [whole.off_mm - fewer.off_mm for whole, fewer in both]
+        assert np.abs(moved_mm).max() < 0.012
+
+
 def test_a_seen_tip_face_needs_no_end():
     scan = blades.scan(SCREW, 3.0, np.random.default_rng(32))
     assert ends_of(scan.points_mm) == ()
