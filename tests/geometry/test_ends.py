@@ -102,7 +102,7 @@ def test_few_points_make_no_sharp_end_ragged():
 
 
 def test_no_single_point_decides_where_a_scan_stops():
-    """Nearer to the last point than its noise no end is told: without that point both stay where they were."""
+    """Nearer to the last point than its noise no end is told: without that point both stay where they are."""
     for seed in range(100, 120):
         points_mm = open_scan(seed)
         fewer_mm = np.delete(points_mm, np.argmax(points_mm[:, 2]), axis=0)
