@@ -55,6 +55,11 @@ def local_quadrics(at_mm: Floats, points_mm: Floats) -> tuple[Floats, Floats, Fl
     return feet_mm, frames, fit[:, 3:]
 
 
+def quadric_terms(u: Floats, v: Floats) -> Floats:
+    """The terms (..., 6) of a full quadric at places: 1, u, v, u^2, u v, v^2."""
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+
+
 def _tilted(frames: Floats, slope: Floats) -> Floats:
     """Frames whose normals are those of surfaces with that slope (n, 2) in the old ones."""
     normal = frames[:, 2] - slope[:, :1] * frames[:, 0] - slope[:, 1:] * frames[:, 1]

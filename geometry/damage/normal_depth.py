@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
+from geometry.damage.local_shape import quadric_terms
 from geometry.damage.regions import Field, Region
 from geometry.damage.skin import Skin, skin_of
 from geometry.deformation.twin import Twin
@@ -134,7 +135,7 @@ class _Bottom:
 
 def _bottom(at_mm: Floats, depth_mm: Floats, where: Ints) -> _Bottom:
     """The deepest of the places `where` on the full quadric through points (n, 2) with depths (n,)."""
-    terms = _terms(at_mm)
+    terms = quadric_terms(*at_mm.T)
     inverse = np.linalg.pinv(terms, rcond=1e-6)
     fitted_mm = terms @ (inverse @ depth_mm)
     free = max(len(depth_mm) - terms.shape[1], 1)
@@ -145,8 +146,3 @@ def _bottom(at_mm: Floats, depth_mm: Floats, where: Ints) -> _Bottom:
         noise_mm=scatter_mm * float(np.linalg.norm(terms[deepest] @ inverse)),
         rise_mm=float(fitted_mm[deepest] - fitted_mm[where].min()),
     )
-
-
-def _terms(at_mm: Floats) -> Floats:
-    u, v = at_mm.T
-    return np.stack([np.ones_like(u), u, v, u**2, u * v, v**2], axis=1)

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.damage.broken import BrokenSurface
-from geometry.damage.local_shape import frames_along
+from geometry.damage.local_shape import frames_along, quadric_terms
 from geometry.damage.skin import Skin
 from geometry.errors import CannotRepair
 from geometry.kernels.implicit_solid import column_crossings
@@ -56,7 +56,7 @@ def _heights(at_mm: Floats, points_mm: Floats) -> Floats:
     reach_mm = distance_mm[:, -1:]
     weight = 1.0 / ((distance_mm / reach_mm) ** 2 + 1e-2)
     u, v = np.moveaxis((points_mm[index, :2] - at_mm[:, None]) / reach_mm[..., None], 2, 0)
-    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
+    design = quadric_terms(u, v)
     normal = np.einsum("nk,nki,nkj->nij", weight, design, design)
     normal += np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.diag(RIDGE)
     right = np.einsum("nk,nki,nk->ni", weight, design, points_mm[index, 2])
