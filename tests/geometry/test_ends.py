@@ -88,11 +88,11 @@ def test_a_short_scan_has_no_ends():
     assert ends_of(points_mm[points_mm[:, 2] < 104.7]) == ()
 
 
-def test_a_ragged_scan_has_no_ends():
-    for seed in range(31, 36):
-        points_mm = open_scan(seed, 6.0)
-        ragged = points_mm[:, 2] < 104.7 + 0.3 * np.sin(0.7 * points_mm[:, 0])
-        assert ends_of(points_mm[ragged]) == ()
+@pytest.mark.parametrize(("seed", "per_mm2"), [(31, 3.0), *((seed, 6.0) for seed in range(31, 36))])
+def test_a_ragged_scan_has_no_ends(seed, per_mm2):
+    points_mm = open_scan(seed, per_mm2)
+    ragged = points_mm[:, 2] < 104.7 + 0.3 * np.sin(0.7 * points_mm[:, 0])
+    assert ends_of(points_mm[ragged]) == ()
 
 
 def test_few_points_make_no_sharp_end_ragged():
