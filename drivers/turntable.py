@@ -29,6 +29,7 @@ from drivers.wire.turntable import (
 
 Value = TypeVar("Value")
 
+_CONNECT_S = 2.0  # a network's time, not the device's: the same however soon a reply is due
 _TRIES = 3
 _POLL_S = 0.02
 _APPROACH_DEG = 1.0  # undershoot of a move that would come from above
@@ -85,7 +86,7 @@ class Turntable:
 
     async def __aenter__(self) -> Self:
         self._line = await open_line(
-            "turntable", self.port, baud=self._baud, timeout_s=self._reply_timeout_s * 4, trace=self._trace
+            "turntable", self.port, baud=self._baud, timeout_s=_CONNECT_S, trace=self._trace
         )
         try:
             self._identity = await self._identify()

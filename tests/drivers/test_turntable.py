@@ -20,7 +20,7 @@ from simulators.faults import Faults
 from simulators.serve import PtyServer, TcpServer, serve_pty, serve_tcp
 from simulators.turntable import Setting, TurntableDevice
 
-QUICK_S = 0.05
+QUICK_S = 0.2  # for a reply that never comes; those that do come may be late on a busy machine
 Twist = Callable[[bytes, bytes | None], list[bytes]]
 
 
