@@ -155,13 +155,16 @@ def _nine(centres_mm: Floats, normals: Floats, step_mm: float) -> Floats:
 def _seen_skin(
     cloud: Cloud, alignment: Alignment, nominal: Nominal, twin: Twin | None, normal_mm: float, raised: Bools
 ) -> tuple[Floats, Floats]:
-    """Where on the nominal (n, 3) the scan shows skin or what took its place, and the nominal's normals."""
-    foot = nominal.closest(apply(alignment.T_nominal_scan, cloud.points_mm))
-    off_mm = foot.distance_mm
+    """Where on the nominal (n, 3) the scan shows skin or what took its place, and the nominal's normals.
+
+    Each point goes back by what the twin has moved there: beside a sharp edge that wore away no point would
+    have its foot on the edge's end.
+    """
+    points_mm = apply(alignment.T_nominal_scan, cloud.points_mm)
     if twin is not None:
-        nearest = cKDTree(twin.mesh.vertices_mm - twin.displacement_mm).query(foot.points_mm)[1]
-        off_mm = off_mm - (twin.displacement_mm[nearest] * foot.normals).sum(axis=1)
-    shown = (np.abs(off_mm) <= normal_mm) | raised
+        points_mm = points_mm - twin.displacement_mm[cKDTree(twin.mesh.vertices_mm).query(points_mm)[1]]
+    foot = nominal.closest(points_mm)
+    shown = (np.abs(foot.distance_mm) <= normal_mm) | raised
     return foot.points_mm[shown], foot.normals[shown]
 
 

@@ -102,6 +102,33 @@ def test_the_other_side_of_a_thin_edge_does_not_stand_in() -> None:
     assert rows[Zone.TRAILING_EDGE].largest_gap_mm > 2.0
 
 
+def test_an_edge_that_wore_back_is_seen_where_it_went() -> None:
+    """Of an edge 0.8 mm back every point has its foot on the nominal's sides, none on its end."""
+    specimen = sound()
+    mesh, points_mm = specimen.twin.mesh, specimen.cloud.points_mm
+    worn_mm = worn_back(mesh.vertices_mm, 0.8)
+    twin = replace(
+        specimen.twin,
+        mesh=replace(mesh, vertices_mm=worn_mm),
+        displacement_mm=specimen.twin.displacement_mm + worn_mm - mesh.vertices_mm,
+    )
+    cloud = replace(specimen.cloud, points_mm=worn_back(points_mm, 0.8))
+    rows = coverage_of(replace(specimen, twin=twin, cloud=cloud))
+    assert len(seen(rows)) == 4
+    assert rows[Zone.TRAILING_EDGE].largest_gap_mm < 1.2
+
+
+def worn_back(points_mm: blades.Array, back_mm: float) -> blades.Array:
+    """Points (n, 3) within 3 mm of the trailing edge moved towards the leading one, the nearest most."""
+    edge_mm = np.array([blades.trailing_edge_at(z_mm) for z_mm in np.linspace(0.0, blades.SPAN_MM, 121)])
+    lead_mm = np.array([blades.leading_edge_at(z_mm) for z_mm in np.linspace(0.0, blades.SPAN_MM, 121)])
+    index = np.clip(np.rint(points_mm[:, 2] / blades.SPAN_MM * 120.0), 0, 120).astype(int)
+    back = lead_mm[index] - edge_mm[index]
+    back /= np.linalg.norm(back, axis=1)[:, None]
+    near_mm = ((points_mm - edge_mm[index]) * back)[:, :2].sum(axis=1)
+    return np.asarray(points_mm + back_mm * np.clip(1.0 - near_mm / 3.0, 0.0, 1.0)[:, None] * back)
+
+
 def test_a_tip_face_that_was_not_scanned_is_missed() -> None:
     specimen = sound()
     face = specimen.cloud.points_mm[:, 2] > blades.SPAN_MM - 0.08
