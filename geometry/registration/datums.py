@@ -19,11 +19,10 @@ from geometry.registration.fit import (
     motions,
     tukey,
     unit_motions,
-    unit_twist,
 )
 from geometry.registration.form_effect import Surface, form_effect
+from geometry.registration.loose import loose_motions
 from geometry.registration.register import RegisterSettings, mask_damage, neighbours_of
-from geometry.registration.uncertainty import certainty
 from geometry.robust import TUKEY, robust_sigma
 from geometry.scan.neighbourhood import Neighboured, surface_shares
 from geometry.threads import one_blas_thread
@@ -152,8 +151,7 @@ def _alignment(
     moved_mm, found = apply(fit.T_nominal_scan, cloud.points_mm)[kept], fit.found.of(kept)
     known = information(nominal, moved_mm, found.normals, cloud.sigma_mm[kept], shares[kept])
     effect = form_effect(nominal, moved_mm, found, shares[kept], whole)
-    left = certainty(nominal, known, effect.form)
-    loose = tuple(unit_twist(t) for t in left.twists.T[left.sigma_mm > settings.register.loose_mm])
+    loose = tuple(loose_motions(nominal, known, effect, whole, settings.register.loose_mm))
     return replace(
         start,
         method=method,

@@ -10,6 +10,8 @@ from geometry.registration.alignment import Alignment
 from geometry.registration.coarse import Coarse, CoarseSettings, find_pose
 from geometry.registration.ends import on_rim, without_strays
 from geometry.registration.fit import Fit, every, felt, fit_kept, fit_robust, unit_twist
+from geometry.registration.form_effect import required
+from geometry.registration.loose import loose_motions
 from geometry.registration.mask import MaskSettings, damaged, form_of, ringed
 from geometry.registration.settled import Settled, held_by_ends
 from geometry.registration.size import check_size
@@ -30,8 +32,8 @@ class RegisterSettings:
     fit_points: int = 250_000  # of the cloud, for mask and least squares: 0.0005 mm of noise at most
     rounds: int = 2  # of mask and least squares
     explained_mm: float = 0.3
-    loose_mm: float = 0.3  # standard uncertainty of the surface along a motion that makes it a free one
-    slide_mm: float = 0.05  # the same, beyond which other places along that motion are tried
+    loose_mm: float = 0.3  # off the best fit along a motion, one sigma, that makes it a free one
+    slide_mm: float = 0.05  # off a part without form, beyond which other places along that motion are tried
 
     def __post_init__(self) -> None:
         if not (self.least_points >= 50 and self.robust_points >= 500 and self.rounds >= 1):
@@ -167,9 +169,9 @@ def _alignment(
         T_nominal_scan=fit.T_nominal_scan,
         pivot_mm=nominal.pivot_mm,
         information=settled.information,
-        form_covariance=settled.form_covariance,
-        unseen_covariance=settled.unseen_covariance,
-        weak_directions=_weak(places, settings),
+        form_covariance=settled.effect.form,
+        unseen_covariance=settled.effect.unseen,
+        weak_directions=_weak(nominal, places, settings),
         rms_mm=float(np.sqrt(np.mean(residual_mm**2))),
         noise_mm=robust_sigma(residual_mm),
         inlier_fraction=float(kept.mean()),
@@ -180,10 +182,12 @@ def _alignment(
     )
 
 
-def _weak(places: list[Settled], settings: RegisterSettings) -> tuple[tuple[float, ...], ...]:
+def _weak(
+    nominal: Nominal, places: list[Settled], settings: RegisterSettings
+) -> tuple[tuple[float, ...], ...]:
     """Unit twists that the chosen place leaves open, or that two places contest."""
     chosen = places[min(1, len(places) - 1)]
-    open_ = [unit_twist(t) for t in chosen.certainty.twists.T[chosen.certainty.sigma_mm > settings.loose_mm]]
+    open_ = loose_motions(nominal, chosen.information, chosen.effect, required(nominal), settings.loose_mm)
     if len(places) > 2 and not _won(places):
         open_ = open_ or [unit_twist(places[0].certainty.twists[:, -1])]
     return tuple(open_) if len(open_) > len(chosen.fit.weak) else chosen.fit.weak

@@ -7,7 +7,7 @@ import numpy as np
 from geometry.blade.nominal import Nominal
 from geometry.registration.ends import End, scan_ends
 from geometry.registration.fit import Fit, Held, felt, fit_kept, information, motions, unit_motions
-from geometry.registration.form_effect import form_effect, required
+from geometry.registration.form_effect import FormEffect, form_effect, required
 from geometry.registration.uncertainty import Certainty, certainty, free_inverse
 from geometry.transforms import apply, inverse
 from geometry.types import Bools, Cloud, Floats
@@ -26,8 +26,7 @@ class Settled:
     kept: Bools
     normal_matrix: Floats  # (6, 6) of the kept points, each by its share
     information: Floats
-    form_covariance: Floats
-    unseen_covariance: Floats
+    effect: FormEffect
     certainty: Certainty
 
 
@@ -70,8 +69,7 @@ def _worth(cloud: Cloud, fit: Fit, shares: Floats, nominal: Nominal) -> Settled:
         kept=kept,
         normal_matrix=(design.T * share) @ design,
         information=known,
-        form_covariance=effect.form,
-        unseen_covariance=effect.unseen,
+        effect=effect,
         certainty=certainty(nominal, known, effect.form),
     )
 
@@ -102,12 +100,13 @@ def _with_ends(settled: Settled, fit: Fit, held: Held, ends: tuple[End, ...], no
     noise = share @ free_inverse(settled.information, scale) @ share.T
     noise += both @ (weighted * [end.sigma_mm**2 for end in ends]) @ weighted.T @ both
     known = np.linalg.inv(noise / unit) / unit
-    form = share @ settled.form_covariance @ share.T
+    effect = FormEffect(
+        form=share @ settled.effect.form @ share.T, unseen=share @ settled.effect.unseen @ share.T
+    )
     return replace(
         settled,
         fit=fit,
         information=known,
-        form_covariance=form,
-        unseen_covariance=share @ settled.unseen_covariance @ share.T,
-        certainty=certainty(nominal, known, form),
+        effect=effect,
+        certainty=certainty(nominal, known, effect.form),
     )
