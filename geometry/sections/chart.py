@@ -62,8 +62,8 @@ class SectionSettings:
     blend_limit_mm: float = 0.005  # ... what is then still more than this off takes no part
     steepest: float = 1.0  # mm outward per mm of height: what lies flatter belongs to a fillet or a tip face
     knot_mm: float = 1.0  # spline knots along the sides ...
-    edge_refinement: float = 4.0  # ... and this many times closer at the edges
-    edge_mm: float = 2.0  # half width of the refined arc
+    edge_refinement: float = 6.0  # ... and this many times closer at the edges
+    edge_mm: float = 0.7  # half width of the refined arc: the rounding of an edge, not the taper behind it
     z_knot_mm: float = 4.0
     capture_mm: float = 1.0  # farther from the moved nominal is no point of the profile
     outlier: float = 5.0  # standard deviations

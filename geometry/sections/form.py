@@ -111,10 +111,13 @@ class WaveBand:
 def wave_band(arc_mm: Floats, share_mm: Floats, wave_mm: tuple[float, float]) -> WaveBand:
     """The harmonics with wavelengths `wave_mm` (shortest, longest) of nodes at `arc_mm` (m,).
 
-    An ideal band pass over the closed arc: no run-in, no run-out.
+    An ideal band pass over the closed arc: no run-in, no run-out. Each is made orthogonal to all longer
+    ones, which sums over uneven nodes are only nearly.
     """
     perimeter = float(share_mm.sum())
     first, last = int(np.ceil(perimeter / wave_mm[1])), int(perimeter / wave_mm[0])
-    phase = 2.0 * np.pi * np.outer(np.arange(first, last + 1), arc_mm) / perimeter
-    harmonics = np.sqrt(2.0 / perimeter) * np.vstack([np.cos(phase), np.sin(phase)])
-    return WaveBand(harmonics=harmonics, share_mm=share_mm)
+    phase = 2.0 * np.pi * np.outer(np.arange(1, last + 1), arc_mm) / perimeter
+    pairs = np.stack([np.cos(phase), np.sin(phase)], axis=1).reshape(-1, len(arc_mm))
+    root = np.sqrt(share_mm)
+    orthonormal = np.linalg.qr((root * np.vstack([np.ones(len(arc_mm)), pairs])).T)[0].T / root
+    return WaveBand(harmonics=orthonormal[2 * first - 1 :], share_mm=share_mm)

@@ -216,7 +216,7 @@ def test_waviness_is_the_sine_in_its_band_and_nothing_else():
     wave = 0.01 * np.sin(2.0 * np.pi * 12 * arc / perimeter)
     rest = 0.2 * np.sin(2.0 * np.pi * 2 * arc / perimeter) + 0.05
     band = wave_band(arc, share, (2.5, 15.0))
-    assert_allclose(band.waves(wave + rest), wave, atol=2e-5)
+    assert_allclose(band.waves(wave + rest), wave, atol=1e-6)
     assert band.rms(wave + rest).value == pytest.approx(0.01 / np.sqrt(2.0), rel=2e-3)
     assert band.height(wave + rest).value == pytest.approx(0.02, rel=3e-3)
 
