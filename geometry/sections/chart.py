@@ -176,15 +176,24 @@ def unroll(nominal: Nominal, z_mm: float, reach_mm: float, settings: SectionSett
     nodes = np.stack([nodes_at(height) for height in heights])
     trusted = np.stack([three.wrong_mm <= settings.blend_limit_mm for three in threes])
     here = heights.index(z_mm)
-    seeds, across, corner, cell = _seeds(nodes, here)
-    arc = np.concatenate([[0.0], np.cumsum(_lengths(nodes[here]))])
+    return _chart(np.array(heights), nodes, trusted, here, _sides(nominal.section(z_mm), nodes[here]))
+
+
+def with_nodes(chart: Chart, nodes_mm: Floats) -> Chart:
+    """The chart of other curves (2 k + 1, NODES, 2) at the same heights, whose nodes correspond."""
+    trusted = np.isfinite(chart.curves[:, :, 6])
+    return _chart(chart.z_mm, nodes_mm, trusted, chart.here, chart.side)
+
+
+def _chart(z_mm: Floats, nodes_mm: Floats, trusted: Bools, here: int, side: Ints) -> Chart:
+    seeds, across, corner, cell = _seeds(nodes_mm, here)
     return Chart(
-        z_mm=np.array(heights),
-        nodes_mm=nodes,
-        curves=_curves(np.array(heights), nodes, trusted),
+        z_mm=z_mm,
+        nodes_mm=nodes_mm,
+        curves=_curves(z_mm, nodes_mm, trusted),
         here=here,
-        arc_mm=arc,
-        side=_sides(nominal.section(z_mm), nodes[here]),
+        arc_mm=np.concatenate([[0.0], np.cumsum(_lengths(nodes_mm[here]))]),
+        side=side,
         seeds=seeds,
         across_mm=across,
         corner_mm=corner,

@@ -22,6 +22,7 @@ from geometry.sections.chart import (
     unroll,
 )
 from geometry.sections.motion import Motion, find_motion, rigid_columns
+from geometry.sections.worn_edges import with_worn_edges
 from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints
 
@@ -134,7 +135,8 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     if len(inside) < settings.min_points:
         raise CannotMeasure(f"no sound points within {settings.band_mm:g} mm of the plane")
     sound = scan.points_mm(inside)
-    motion = find_motion(chart, sound)
+    nominal, motion = chart, find_motion(chart, sound)
+    chart = with_worn_edges(nominal, motion, sound)
     band = onto_chart(sound, scan.cloud.sigma_mm.take(inside), chart, motion, settings)
     if len(band.node) < settings.min_points:
         raise CannotMeasure("no sound points near the nominal section")
@@ -150,7 +152,7 @@ def reconstruct(scan: Scan, chart: Chart, settings: SectionSettings) -> Profile:
     return Profile(
         chart=chart,
         curve_mm=curve_mm,
-        deviation_mm=chart.project(np.column_stack([curve_mm, height_mm]))[:, 1],
+        deviation_mm=nominal.project(np.column_stack([curve_mm, height_mm]))[:, 1],
         gaps=find_gaps(chart, arc, widest),
         zones=cover_zones(chart.curve_mm, chart.side, arc, widest),
         noise_mm=noise_mm,

@@ -1,0 +1,95 @@
+"""The nominal with its edges where the part's are: an edge may lose more than its rounding is wide.
+
+Of such an edge no point has its foot on the end of the nominal's, and no displacement along normals leads
+from the one to the other. So the nominal's edges are pushed back along the chord first, as far as the points
+say; what is then left is small.
+"""
+
+import numpy as np
+
+from geometry.sections.chart import NODES, Chart, with_nodes
+from geometry.sections.motion import Motion
+from geometry.types import Floats
+
+EDGES = (0, NODES // 2)  # nodes: trailing, leading
+REACH_MM = 3.0  # from an edge, over which its push fades
+NEAR_MM = 1.5  # from an edge: points that tell of it, ...
+POINTS = 300  # ... below the section and above it no more than so many ...
+LEAST = 20  # ... nor fewer
+TRIED_MM = np.linspace(0.0, 1.0, 41)  # pushes
+LEAST_MM = 0.2  # of a push: less is as well told along normals
+WORN_MM = 0.03  # off the nominal, near an edge (rms): where it is less nothing is pushed, ...
+BETTER = 0.5  # ... nor unless no more than this share of it is left
+FAR_MM = 0.3  # farther off counts as so far: single points decide nothing
+
+
+def with_worn_edges(chart: Chart, motion: Motion, points_mm: Floats) -> Chart:
+    """The chart, each edge pushed back as far as the points (n, 3) of a part stop short of it.
+
+    The push may differ below the section and above it, and is linear in height between and beyond.
+    """
+    place_mm = motion.undo(points_mm)
+    moved_mm = sum((_moved_mm(chart, edge, place_mm) for edge in EDGES), start=np.zeros(1))
+    return with_nodes(chart, chart.nodes_mm + moved_mm) if moved_mm.any() else chart
+
+
+def _moved_mm(chart: Chart, edge: int, place_mm: Floats) -> Floats:
+    """How far an edge takes each node with it, (2 k + 1, NODES, 2)."""
+    near_mm = place_mm[_behind_mm(chart, edge, place_mm) < NEAR_MM]
+    below = near_mm[:, 2] < chart.section_z_mm
+    halves = [half for half in (near_mm[below], near_mm[~below]) if len(half) >= LEAST]
+    if not halves:
+        return np.zeros_like(chart.nodes_mm)
+    heights_mm = [float(half[:, 2].mean()) for half in halves]
+    push_mm = np.interp(chart.z_mm, heights_mm, [_push_mm(chart, edge, half) for half in halves])
+    stands_mm = np.stack([_behind_mm(chart, edge, _at(nodes, z)) for nodes, z in _layers(chart)])
+    shares = np.clip(1.0 - stands_mm / REACH_MM, 0.0, 1.0) ** 2
+    return np.asarray((push_mm[:, None] * shares)[:, :, None] * _inward(chart, edge))
+
+
+def _push_mm(chart: Chart, edge: int, near_mm: Floats) -> float:
+    """The push after which points (n, 3) near an edge lie on the nominal best."""
+    few_mm = near_mm[:: max(1, len(near_mm) // POINTS)]
+    off_mm = _off_mm(chart, edge, few_mm, 0.0)
+    if off_mm <= WORN_MM:
+        return 0.0
+    left_mm = [_off_mm(chart, edge, few_mm, push_mm) for push_mm in TRIED_MM.tolist()]
+    best = int(np.argmin(left_mm))
+    found = left_mm[best] < BETTER * off_mm and TRIED_MM[best] >= LEAST_MM
+    return float(TRIED_MM[best]) if found else 0.0
+
+
+def _off_mm(chart: Chart, edge: int, points_mm: Floats, push_mm: float) -> float:
+    """How far points (n, 3) are off a nominal whose edge is pushed back (rms)."""
+    back_mm = _before_mm(_behind_mm(chart, edge, points_mm), push_mm)
+    place_mm = points_mm + np.pad(back_mm[:, None] * _inward(chart, edge), ((0, 0), (0, 1)))
+    return float(np.sqrt(np.mean(np.minimum(np.abs(chart.project(place_mm)[:, 1]), FAR_MM) ** 2)))
+
+
+def _before_mm(behind_mm: Floats, push_mm: float) -> Floats:
+    """How far a push carried what now lies so far behind the edge, taken back: the root of
+    now = share + push (1 - share)^2, in shares of the reach."""
+    now, push = behind_mm / REACH_MM, push_mm / REACH_MM
+    slope = 1.0 - 2.0 * push
+    share = 2.0 * (now - push) / (slope + np.sqrt(np.maximum(slope**2 + 4.0 * push * (now - push), 0.0)))
+    return np.asarray(np.where(now < 1.0, share - now, 0.0) * REACH_MM)
+
+
+def _behind_mm(chart: Chart, edge: int, points_mm: Floats) -> Floats:
+    """How far points (n, 3) lie inward of the nominal's edge, along the chord."""
+    path = [np.interp(points_mm[:, 2], chart.z_mm, chart.nodes_mm[:, edge, axis]) for axis in (0, 1)]
+    return np.asarray((points_mm[:, :2] - np.column_stack(path)) @ _inward(chart, edge))
+
+
+def _inward(chart: Chart, edge: int) -> Floats:
+    """The direction (2,) along the chord from an edge to the other one."""
+    chord = chart.curve_mm[(edge + NODES // 2) % NODES] - chart.curve_mm[edge]
+    return np.asarray(chord / np.linalg.norm(chord))
+
+
+def _layers(chart: Chart) -> list[tuple[Floats, float]]:
+    return list(zip(chart.nodes_mm, chart.z_mm.tolist(), strict=True))
+
+
+def _at(nodes_mm: Floats, z_mm: float) -> Floats:
+    return np.column_stack([nodes_mm, np.full(len(nodes_mm), z_mm)])
