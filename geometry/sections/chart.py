@@ -19,6 +19,7 @@ from geometry.kernels.profile import lay, project
 from geometry.types import Bools, Floats, Ints
 
 NODES = 2048  # of a profile; half on each side between the edges
+BROAD = 4  # nodes: at an edge about as far as the facets of a nominal are long
 
 
 Freedom = Literal["x", "y", "rotation"]
@@ -204,6 +205,15 @@ def _chart(z_mm: Floats, nodes_mm: Floats, trusted: Bools, here: int, side: Ints
 def outward_normals(curve_mm: Floats) -> Floats:
     """Unit outward normals (m, 2) of a closed counter-clockwise curve, from each node's neighbours."""
     return np.asarray(closed_normals(np.ascontiguousarray(curve_mm)))
+
+
+def broad_normals(curve_mm: Floats) -> Floats:
+    """The same from nodes `BROAD` to either side: of a polygon of facets they turn smoothly.
+
+    Its own jump at each corner, where what is drawn inward along them would fold.
+    """
+    x, y = (np.roll(curve_mm, -BROAD, axis=0) - np.roll(curve_mm, BROAD, axis=0)).T
+    return np.asarray(np.column_stack([y, -x]) / np.hypot(x, y)[:, None])
 
 
 def outward_normal(curve_mm: Floats, node: int) -> Floats:

@@ -17,6 +17,7 @@ from geometry.sections.chart import (
     NODES,
     Chart,
     SectionSettings,
+    broad_normals,
     curvature,
     outward_normals,
     unroll,
@@ -173,7 +174,7 @@ def _drawn(
 
     Noise along the surface lifts points off a bent one by half its variance over the radius: taken off again.
     """
-    normals = outward_normals(chart.curve_mm)
+    normals = broad_normals(chart.curve_mm)
     columns = rigid_columns(chart.curve_mm, normals, motion.pivot_mm, np.zeros(NODES))
     height = np.full(NODES, chart.section_z_mm)
     deviation = fit.values(knots.u(np.arange(NODES, dtype=np.float64)), knots.v(height), columns)

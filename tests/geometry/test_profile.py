@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from geometry.errors import BadInput, CannotMeasure
-from geometry.sections.chart import NODES, SectionSettings, outward_normals, unroll
+from geometry.sections.chart import NODES, SectionSettings, broad_normals, outward_normals, unroll
 from geometry.sections.motion import find_motion
 from geometry.sections.profile import Gap, find_gaps, reconstruct
 from tests.geometry.airfoils import AnalyticNominal, Blade, Part, scan_in_place
@@ -74,6 +74,22 @@ def test_projection_gives_back_offset_nodes_with_their_sign():
         assert_allclose(found[:, 1], offset, atol=4e-5)
         turn = (found[:, 0] - nodes + NODES / 2) % NODES - NODES / 2
         assert np.abs(turn).max() < 0.2
+
+
+@pytest.mark.parametrize("inward_mm", [0.05, 0.15])
+def test_what_is_drawn_inward_of_facets_does_not_fold(inward_mm):
+    """An edge of 0.25 mm radius in 24 facets, ten nodes on each."""
+    corner = 2.0 * np.pi * np.arange(25) / 24
+    at = np.arange(240) / 10.0
+    edge_mm = 0.25 * np.column_stack([np.interp(at, np.arange(25), f(corner)) for f in (np.cos, np.sin)])
+    tangents = np.roll(edge_mm, -1, axis=0) - np.roll(edge_mm, 1, axis=0)
+
+    def least_step(normals):
+        drawn_mm = edge_mm - inward_mm * normals
+        return ((np.roll(drawn_mm, -1, axis=0) - drawn_mm) * tangents).sum(axis=1).min()
+
+    assert least_step(broad_normals(edge_mm)) > 0.0
+    assert least_step(outward_normals(edge_mm)) < 0.0
 
 
 def test_a_rigid_motion_is_found_among_outliers():
