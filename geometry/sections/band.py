@@ -29,7 +29,7 @@ from geometry.sections.motion import Motion
 from geometry.types import Bools, Floats
 
 _PILOT_POINTS = 10_000  # of a band, to tell outliers ...
-_BENDING_PER_MM = np.array([5e-3, 5e-2, 5e-4])  # of what is told from outliers: sides, edges, along the span
+_BENDING_PER_MM = np.array([5e-3, 2e-1, 5e-4])  # of what is told from outliers: sides, edges, along the span
 _START = np.array([5e4, 5e4, 1e8])  # of the search for the strengths: those of a blade in service
 _RIGID_PRIOR = np.array([0.3, 0.3, 0.02, 0.3, 0.3, 0.02]) ** -2.0  # weak: `find_motion` has taken most
 _PILOT_BINS = (2, 4)  # ... in each knot span along the arc, and across

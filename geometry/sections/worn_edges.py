@@ -17,9 +17,9 @@ NEAR_MM = 1.5  # from an edge: points that tell of it, ...
 POINTS = 300  # ... below the section and above it no more than so many ...
 LEAST = 20  # ... nor fewer
 TRIED_MM = np.linspace(0.0, 1.0, 41)  # pushes
-LEAST_MM = 0.2  # of a push: less is as well told along normals
-WORN_MM = 0.03  # off the nominal, near an edge (rms): where it is less nothing is pushed, ...
-BETTER = 0.5  # ... nor unless no more than this share of it is left
+LEAST_MM = 0.2  # of the larger push: less is as well told along normals
+WORN_MM = 0.02  # off the nominal, near an edge (rms): where it is less nothing is pushed, ...
+BETTER = 0.7  # ... nor unless no more than this share of it is left
 FAR_MM = 0.3  # farther off counts as so far: single points decide nothing
 
 
@@ -38,10 +38,10 @@ def _moved_mm(chart: Chart, edge: int, place_mm: Floats) -> Floats:
     near_mm = place_mm[_behind_mm(chart, edge, place_mm) < NEAR_MM]
     below = near_mm[:, 2] < chart.section_z_mm
     halves = [half for half in (near_mm[below], near_mm[~below]) if len(half) >= LEAST]
-    if not halves:
+    pushes_mm = [_push_mm(chart, edge, half) for half in halves]
+    if max(pushes_mm, default=0.0) < LEAST_MM:
         return np.zeros_like(chart.nodes_mm)
-    heights_mm = [float(half[:, 2].mean()) for half in halves]
-    push_mm = np.interp(chart.z_mm, heights_mm, [_push_mm(chart, edge, half) for half in halves])
+    push_mm = np.interp(chart.z_mm, [float(half[:, 2].mean()) for half in halves], pushes_mm)
     stands_mm = np.stack([_behind_mm(chart, edge, _at(nodes, z)) for nodes, z in _layers(chart)])
     shares = np.clip(1.0 - stands_mm / REACH_MM, 0.0, 1.0) ** 2
     return np.asarray((push_mm[:, None] * shares)[:, :, None] * _inward(chart, edge))
@@ -55,15 +55,19 @@ def _push_mm(chart: Chart, edge: int, near_mm: Floats) -> float:
         return 0.0
     left_mm = [_off_mm(chart, edge, few_mm, push_mm) for push_mm in TRIED_MM.tolist()]
     best = int(np.argmin(left_mm))
-    found = left_mm[best] < BETTER * off_mm and TRIED_MM[best] >= LEAST_MM
-    return float(TRIED_MM[best]) if found else 0.0
+    return float(TRIED_MM[best]) if left_mm[best] < BETTER * off_mm else 0.0
 
 
 def _off_mm(chart: Chart, edge: int, points_mm: Floats, push_mm: float) -> float:
-    """How far points (n, 3) are off a nominal whose edge is pushed back (rms)."""
+    """How far points (n, 3) are off a nominal whose edge is pushed back (rms), but for what all of them
+    share: bent metal lies aside of the chord, and metal that wore evenly within both sides."""
+    inward = _inward(chart, edge)
     back_mm = _before_mm(_behind_mm(chart, edge, points_mm), push_mm)
-    place_mm = points_mm + np.pad(back_mm[:, None] * _inward(chart, edge), ((0, 0), (0, 1)))
-    return float(np.sqrt(np.mean(np.minimum(np.abs(chart.project(place_mm)[:, 1]), FAR_MM) ** 2)))
+    foot = chart.project(points_mm + np.pad(back_mm[:, None] * inward, ((0, 0), (0, 1))))
+    off_mm = np.clip(foot[:, 1], -FAR_MM, FAR_MM)
+    shared = np.column_stack([np.ones(len(foot)), foot[:, 2:] @ np.array([-inward[1], inward[0]])])
+    off_mm = off_mm - shared @ np.linalg.lstsq(shared, off_mm, rcond=None)[0]
+    return float(np.sqrt(np.mean(off_mm**2)))
 
 
 def _before_mm(behind_mm: Floats, push_mm: float) -> Floats:
