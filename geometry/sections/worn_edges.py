@@ -1,8 +1,8 @@
 """The nominal with its edges where the part's are: an edge may lose more than its rounding is wide.
 
 Of such an edge no point has its foot on the end of the nominal's, and no displacement along normals leads
-from the one to the other. So the nominal's edges are pushed back along the chord first, as far as the points
-say; what is then left is small.
+from the one to the other; of one that lies as far forward, a displacement along normals is a needle. So the
+nominal's edges are pushed along the chord first, as far as the points say; what is then left is small.
 """
 
 import numpy as np
@@ -16,15 +16,15 @@ REACH_MM = 3.0  # from an edge, over which its push fades
 NEAR_MM = 1.5  # from an edge: points that tell of it, ...
 POINTS = 300  # ... below the section and above it no more than so many ...
 LEAST = 20  # ... nor fewer
-TRIED_MM = np.linspace(0.0, 1.0, 41)  # pushes
-LEAST_MM = 0.2  # of the larger push: less is as well told along normals
+TRIED_MM = np.linspace(-0.5, 1.0, 61)  # pushes; forward ones are negative
+LEAST_MM = 0.2  # either way, of the larger push: less is as well told along normals
 WORN_MM = 0.02  # off the nominal, near an edge (rms): where it is less nothing is pushed, ...
 BETTER = 0.7  # ... nor unless no more than this share of it is left
 FAR_MM = 0.3  # farther off counts as so far: single points decide nothing
 
 
 def with_worn_edges(chart: Chart, motion: Motion, points_mm: Floats) -> Chart:
-    """The chart, each edge pushed back as far as the points (n, 3) of a part stop short of it.
+    """The chart, each edge pushed to where the points (n, 3) of a part have it.
 
     The push may differ below the section and above it, and is linear in height between and beyond.
     """
@@ -39,7 +39,7 @@ def _moved_mm(chart: Chart, edge: int, place_mm: Floats) -> Floats:
     below = near_mm[:, 2] < chart.section_z_mm
     halves = [half for half in (near_mm[below], near_mm[~below]) if len(half) >= LEAST]
     pushes_mm = [_push_mm(chart, edge, half) for half in halves]
-    if max(pushes_mm, default=0.0) < LEAST_MM:
+    if max(map(abs, pushes_mm), default=0.0) < LEAST_MM:
         return np.zeros_like(chart.nodes_mm)
     push_mm = np.interp(chart.z_mm, [float(half[:, 2].mean()) for half in halves], pushes_mm)
     stands_mm = np.stack([_behind_mm(chart, edge, _at(nodes, z)) for nodes, z in _layers(chart)])

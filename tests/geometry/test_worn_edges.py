@@ -45,11 +45,11 @@ def test_a_chart_of_a_whole_blade_stays_as_it_is():
     assert pushed(scanned(1)) is CHART
 
 
-@pytest.mark.parametrize(("edge", "back_mm"), [(EDGES[0], 0.6), (EDGES[1], 0.9)])
+@pytest.mark.parametrize(("edge", "back_mm"), [(EDGES[0], 0.6), (EDGES[1], 0.9), (EDGES[1], -0.3)])
 def test_a_worn_edge_takes_the_chart_along(edge, back_mm):
     chart = pushed(worn(scanned(2), edge, back_mm))
     moved_mm = np.linalg.norm(chart.curve_mm - CHART.curve_mm, axis=1)
-    assert moved_mm[edge] == pytest.approx(back_mm, abs=0.15)
+    assert moved_mm[edge] == pytest.approx(abs(back_mm), abs=0.15)
     assert moved_mm[(edge + NODES // 4) % NODES] == 0.0
     assert moved_mm[(edge + NODES // 2) % NODES] == 0.0
 
@@ -75,7 +75,7 @@ def test_single_points_push_nothing():
 
 
 @pytest.mark.parametrize("edge", EDGES)
-@pytest.mark.parametrize("back_mm", [0.3, 0.6])
+@pytest.mark.parametrize("back_mm", [-0.3, 0.3, 0.6])
 def test_the_section_of_a_worn_edge_is_measured(edge, back_mm):
     """Its end has points all round, though none has its foot on the end of the nominal's."""
     chord_errors_mm = []
