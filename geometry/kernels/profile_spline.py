@@ -330,7 +330,10 @@ def fit_spline(sums: Sums, penalty: Penalty, start: Floats, rounds: int = 12) ->
             break
         if last is not None:
             before, moved = last
-            slopes = slopes + np.outer(ratio - before - slopes @ moved, moved) / float(moved @ moved)
+            if moved.any():
+                slopes = slopes + np.outer(ratio - before - slopes @ moved, moved) / float(moved @ moved)
+            else:  # every strength stayed at the end of its range
+                slopes = _guess(len(start))
         step = -np.linalg.solve(slopes, ratio)
         if not (step @ ratio > 0.0 and np.abs(step).max() <= 4.0 * np.abs(ratio).max()):
             slopes = _guess(len(start))

@@ -16,6 +16,7 @@ REACH_MM = 3.0  # from an edge, over which its push fades
 NEAR_MM = 1.5  # from an edge: points that tell of it, ...
 POINTS = 300  # ... below the section and above it no more than so many ...
 LEAST = 20  # ... nor fewer
+HERE_MM = 1.5  # above the section and below: where its own edge is
 TRIED_MM = np.linspace(-0.5, 1.0, 61)  # pushes; forward ones are negative
 LEAST_MM = 0.2  # either way, of the larger push: less is as well told along normals
 WORN_MM = 0.02  # off the nominal, near an edge (rms): where it is less nothing is pushed, ...
@@ -34,14 +35,20 @@ def with_worn_edges(chart: Chart, motion: Motion, points_mm: Floats) -> Chart:
 
 
 def _moved_mm(chart: Chart, edge: int, place_mm: Floats) -> Floats:
-    """How far an edge takes each node with it, (2 k + 1, NODES, 2)."""
+    """How far an edge takes each node with it, (2 k + 1, NODES, 2).
+
+    Damage may have taken the edge above the section, or below: what is pushed must do good at its own height.
+    """
     near_mm = place_mm[_behind_mm(chart, edge, place_mm) < NEAR_MM]
-    below = near_mm[:, 2] < chart.section_z_mm
-    halves = [half for half in (near_mm[below], near_mm[~below]) if len(half) >= LEAST]
+    height_mm = near_mm[:, 2] - chart.section_z_mm
+    halves = [half for half in (near_mm[height_mm < 0.0], near_mm[height_mm >= 0.0]) if len(half) >= LEAST]
     pushes_mm = [_push_mm(chart, edge, half) for half in halves]
     if max(map(abs, pushes_mm), default=0.0) < LEAST_MM:
         return np.zeros_like(chart.nodes_mm)
     push_mm = np.interp(chart.z_mm, [float(half[:, 2].mean()) for half in halves], pushes_mm)
+    here_mm = near_mm[np.abs(height_mm) <= HERE_MM]
+    if not _better(chart, edge, here_mm, float(push_mm[chart.here])):
+        return np.zeros_like(chart.nodes_mm)
     stands_mm = np.stack([_behind_mm(chart, edge, _at(nodes, z)) for nodes, z in _layers(chart)])
     shares = np.clip(1.0 - stands_mm / REACH_MM, 0.0, 1.0) ** 2
     return np.asarray((push_mm[:, None] * shares)[:, :, None] * _inward(chart, edge))
@@ -50,12 +57,16 @@ def _moved_mm(chart: Chart, edge: int, place_mm: Floats) -> Floats:
 def _push_mm(chart: Chart, edge: int, near_mm: Floats) -> float:
     """The push after which points (n, 3) near an edge lie on the nominal best."""
     few_mm = near_mm[:: max(1, len(near_mm) // POINTS)]
-    off_mm = _off_mm(chart, edge, few_mm, 0.0)
-    if off_mm <= WORN_MM:
+    if _off_mm(chart, edge, few_mm, 0.0) <= WORN_MM:
         return 0.0
-    left_mm = [_off_mm(chart, edge, few_mm, push_mm) for push_mm in TRIED_MM.tolist()]
-    best = int(np.argmin(left_mm))
-    return float(TRIED_MM[best]) if left_mm[best] < BETTER * off_mm else 0.0
+    best = int(np.argmin([_off_mm(chart, edge, few_mm, push_mm) for push_mm in TRIED_MM.tolist()]))
+    return float(TRIED_MM[best]) if _better(chart, edge, few_mm, float(TRIED_MM[best])) else 0.0
+
+
+def _better(chart: Chart, edge: int, points_mm: Floats, push_mm: float) -> bool:
+    """Whether points (n, 3) are off the nominal, and much less so after a push."""
+    off_mm = _off_mm(chart, edge, points_mm, 0.0) if len(points_mm) >= LEAST else 0.0
+    return off_mm > WORN_MM and _off_mm(chart, edge, points_mm, push_mm) < BETTER * off_mm
 
 
 def _off_mm(chart: Chart, edge: int, points_mm: Floats, push_mm: float) -> float:

@@ -146,6 +146,15 @@ def test_erosion_of_the_leading_edge_is_followed():
     assert profile.deviation_mm.min() == pytest.approx(-0.15, abs=0.004)
 
 
+def test_a_scan_without_noise_ends_at_the_strongest_smoothing():
+    """Every strength is at the end of its range: there is no step to learn from."""
+    notched = Part(deviation=lambda s, z: -0.15 * np.exp(-(((s - 0.5) * 180.0) ** 2)) + 0.0 * z)
+    points = notched.scan(np.random.default_rng(4), 46.5, 58.5, 0.2, 0.0)
+    with np.errstate(all="raise", under="ignore"):
+        profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)
+    assert profile.noise_mm < 1e-4
+
+
 def test_noise_is_found():
     points = Part().scan(np.random.default_rng(5), 46.5, 58.5, 0.2, 0.03)
     profile = reconstruct(scan_in_place(points, 0.01), CHART, SETTINGS)

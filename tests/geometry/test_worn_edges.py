@@ -67,6 +67,11 @@ def test_sides_without_their_edge_push_nothing():
     assert pushed(points_mm[apart_mm > 0.9]) is CHART
 
 
+def test_an_edge_lost_elsewhere_pushes_nothing_here():
+    points_mm = scanned(6)
+    assert pushed(worn(points_mm, EDGES[1], np.where(points_mm[:, 2] < 50.5, 0.8, 0.0))) is CHART
+
+
 def test_single_points_push_nothing():
     points_mm = scanned(5)
     rng = np.random.default_rng(5)
