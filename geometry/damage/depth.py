@@ -141,7 +141,9 @@ def edge_loss(region: Region, found: Field, nominal: Nominal, twin: Twin, zone: 
     count = int(np.clip((high_mm - low_mm) / found.spacing_mm, 3, HEIGHTS))
     mesh = between(twin.mesh, low_mm, high_mm)
     heights_mm = np.linspace(low_mm, high_mm, count + 2)[1:-1]
-    rows = [_section_loss(float(z_mm), break_mm, nominal, mesh, zone) for z_mm in heights_mm]
+    rows = [
+        _section_loss(float(z_mm), break_mm, nominal, mesh, zone, found.spacing_mm) for z_mm in heights_mm
+    ]
     loss_mm, scatter_mm, chord_mm = np.array(rows).T
     worst, shortest = int(np.argmax(loss_mm)), int(np.argmin(chord_mm - loss_mm))
     common_mm = np.hypot(region_sigma_mm(region, found), FRONT * found.spacing_mm)
@@ -158,9 +160,13 @@ def edge_loss(region: Region, found: Field, nominal: Nominal, twin: Twin, zone: 
 
 
 def _section_loss(
-    z_mm: float, break_mm: Floats, nominal: Nominal, mesh: Mesh, zone: Zone
+    z_mm: float, break_mm: Floats, nominal: Nominal, mesh: Mesh, zone: Zone, spacing_mm: float
 ) -> tuple[float, float, float]:
-    """Loss at a height, scatter of the break about its quadric there, and the chord of the twin."""
+    """Loss at a height, its standard uncertainty there, and the chord of the twin.
+
+    Where a break grazes the skin it lies on neither for certain. What is left may begin where the quadric
+    meets the skin, or where the last point of the break lies: halfway.
+    """
     outward, edge_mm = _outward(nominal, zone, z_mm)
     across = np.array([-outward[1], outward[0]])
     loop_mm = outline_mm(mesh, z_mm)
@@ -169,15 +175,17 @@ def _section_loss(
     rim_mm = rim_mm[np.linalg.norm(rim_mm - edge_mm, axis=1) < NEAR_EDGE_MM]
     foremost_mm = float((rim_mm @ outward).max())
     near_mm = break_mm[np.argsort(np.abs(break_mm[:, 2] - z_mm))[:FRONT_POINTS]]
-    coefficients, scatter_mm = _quadric(
-        (near_mm[:, :2] - edge_mm) @ across, near_mm[:, 2] - z_mm, foremost_mm - near_mm[:, :2] @ outward
-    )
+    seen_mm = (near_mm[:, :2] - edge_mm) @ across
+    coefficients, scatter_mm = _quadric(seen_mm, near_mm[:, 2] - z_mm, foremost_mm - near_mm[:, :2] @ outward)
     skin_mm, side_mm = foremost_mm - rim_mm @ outward, (rim_mm - edge_mm) @ across
     cut_mm = coefficients[0] + coefficients[1] * side_mm + coefficients[2] * side_mm**2
-    left = skin_mm >= cut_mm
-    if left.all():
+    if (skin_mm >= cut_mm).all():
         return 0.0, scatter_mm, chord_mm
-    return float(min(skin_mm[left].min(initial=np.inf), cut_mm[~left].min())), scatter_mm, chord_mm
+    front_mm = np.maximum(skin_mm, cut_mm)  # of the metal left
+    told = (side_mm >= seen_mm.min() - spacing_mm) & (side_mm <= seen_mm.max() + spacing_mm)
+    least_mm, most_mm = float(front_mm.min()), float(front_mm[told].min(initial=np.inf))
+    unsure_mm = 0.5 * (most_mm - least_mm) if np.isfinite(most_mm) else 0.0
+    return least_mm + unsure_mm, float(np.hypot(scatter_mm, unsure_mm)), chord_mm
 
 
 def between(mesh: Mesh, low_mm: float, high_mm: float) -> Mesh:

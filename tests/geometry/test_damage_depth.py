@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
+from geometry.damage import depth as losses
 from geometry.damage import normal_depth
 from geometry.damage.damages import Damage, find_damages
 from geometry.types import Measurand, Measured, NotMeasured, Zone
@@ -212,10 +213,38 @@ def test_a_rough_break_is_as_deep_as_it_is_told_within_its_uncertainty() -> None
             scanned = blades.specimen({Zone.TIP: cutter}, NOISE_MM, np.random.default_rng(seed), per_mm2)
             mask = scanned.on_break >= 0
             (damage,) = find_damages(scanned.cloud, mask, scanned.alignment, nominal(), scanned.twin)
-            depth = number(damage.depth_mm)
-            ratios.append((depth.value - true_mm) / depth.sigma)
+            told = number(damage.depth_mm)
+            ratios.append((told.value - true_mm) / told.sigma)
     assert np.sqrt(np.mean(np.square(ratios))) <= 1.25
     assert np.abs(ratios).max() <= 3.0
+
+
+def test_a_break_that_grazes_the_skin_begins_between_the_skin_and_its_last_point() -> None:
+    """A slanted break across an edge: whole, and told up to 0.5 mm short of its foremost corner."""
+    z_mm, spacing_mm, slant, rng = 30.0, 0.1, 0.4, np.random.default_rng(3)
+    mesh = losses.between(blades.blade_mesh(), z_mm, z_mm)
+    outward, edge_mm = losses._outward(nominal(), Zone.LEADING_EDGE, z_mm)
+    across = np.array([-outward[1], outward[0]])
+    rim_mm = losses.dense(losses.outline_mm(mesh, z_mm))
+    foremost_mm, side_mm = (rim_mm @ outward).max(), (rim_mm - edge_mm) @ across
+    lost = foremost_mm - rim_mm @ outward < 1.0 + slant * side_mm
+    corner_mm, end_mm = side_mm[lost].min(), side_mm[lost].max()
+
+    def loss(from_mm: float) -> tuple[float, float]:
+        at_mm = rng.uniform(from_mm, end_mm, 200)
+        out_mm = foremost_mm - (1.0 + slant * at_mm) - edge_mm @ outward
+        xy_mm = edge_mm + at_mm[:, None] * across + out_mm[:, None] * outward
+        broken_mm = np.column_stack([xy_mm, rng.uniform(z_mm - 0.5, z_mm + 0.5, 200)])
+        zone = Zone.LEADING_EDGE
+        return losses._section_loss(z_mm, broken_mm, nominal(), mesh, zone, spacing_mm)[:2]
+
+    least_mm = 1.0 + slant * corner_mm
+    told_mm, sigma_mm = loss(corner_mm)
+    assert told_mm == pytest.approx(least_mm, abs=0.03)
+    assert sigma_mm < 0.03
+    told_mm, sigma_mm = loss(corner_mm + 0.5)
+    assert told_mm == pytest.approx(least_mm + 0.5 * slant * 0.4, abs=0.03)
+    assert sigma_mm == pytest.approx(0.5 * slant * 0.4, abs=0.03)
 
 
 def test_the_chord_left_is_that_of_the_cut_section() -> None:
