@@ -5,7 +5,7 @@ import numpy as np
 from geometry.blade.nominal import Nominal
 from geometry.registration.fit import motions, unit_motions, unit_twist
 from geometry.registration.form_effect import FormEffect, Surface
-from geometry.registration.uncertainty import certainty
+from geometry.registration.uncertainty import NO_POINT, certainty
 from geometry.types import Floats
 
 HELD = 0.003  # mean square of a surface's displacement along its normal, for one of a millimetre in all
@@ -29,6 +29,7 @@ def left_to_form(nominal: Nominal, whole: Surface) -> Floats:
     """The part (6, 6) of a twist that the surface hardly feels."""
     scale = unit_motions(nominal)
     design = motions(whole.points_mm, whole.normals, nominal.pivot_mm) * scale
-    felt, motion = np.linalg.eigh((design.T * whole.shares) @ design / whole.shares.sum())
+    share = max(float(whole.shares.sum()), NO_POINT)
+    felt, motion = np.linalg.eigh((design.T * whole.shares) @ design / share)
     free = motion[:, felt < HELD]
     return np.asarray(scale[:, None] * (free @ free.T) / scale)

@@ -59,3 +59,8 @@ def test_a_pose_that_noise_leaves_open_is_loose_all_over():
     nothing = FormEffect(form=np.zeros((6, 6)), unseen=np.zeros((6, 6)))
     assert len(loose_motions(nominal(), 1e-3 * CERTAIN, nothing, required(nominal()), LOOSE_MM)) == 0
     assert len(loose_motions(nominal(), 1e-9 * CERTAIN, nothing, required(nominal()), LOOSE_MM)) == 6
+
+
+def test_of_a_surface_that_is_none_all_is_left_to_form():
+    nothing = Surface(points_mm=np.zeros((0, 3)), normals=np.zeros((0, 3)), shares=np.zeros(0))
+    assert left_to_form(nominal(), nothing) == pytest.approx(np.eye(6))
