@@ -208,9 +208,9 @@ def outward_normals(curve_mm: Floats) -> Floats:
 
 
 def broad_normals(curve_mm: Floats) -> Floats:
-    """The same from nodes `BROAD` to either side: of a polygon of facets they turn smoothly.
+    """The same from nodes `BROAD` to either side: along a polygon of facets they turn smoothly.
 
-    Its own jump at each corner, where what is drawn inward along them would fold.
+    The normals of the polygon itself jump at each corner, and what is drawn inward along them folds there.
     """
     x, y = (np.roll(curve_mm, -BROAD, axis=0) - np.roll(curve_mm, BROAD, axis=0)).T
     return np.asarray(np.column_stack([y, -x]) / np.hypot(x, y)[:, None])

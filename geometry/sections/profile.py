@@ -47,9 +47,9 @@ class ZoneArc:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Profile:
-    """The reconstructed section: NODES nodes that correspond to those of the chart's nominal curve."""
+    """The reconstructed section: NODES nodes that correspond to those of the chart's curve."""
 
-    chart: Chart
+    chart: Chart  # of the nominal, its edges pushed to where the part has them
     curve_mm: Floats  # (NODES, 2) nominal frame; inside a gap it is no measurement
     deviation_mm: Floats  # (NODES,) signed distance to the nominal section, positive outside
     gaps: tuple[Gap, ...]

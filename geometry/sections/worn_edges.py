@@ -30,7 +30,7 @@ def with_worn_edges(chart: Chart, motion: Motion, points_mm: Floats) -> Chart:
     The push may differ below the section and above it, and is linear in height between and beyond.
     """
     place_mm = motion.undo(points_mm)
-    moved_mm = sum((_moved_mm(chart, edge, place_mm) for edge in EDGES), start=np.zeros(1))
+    moved_mm = np.sum([_moved_mm(chart, edge, place_mm) for edge in EDGES], axis=0)
     return with_nodes(chart, chart.nodes_mm + moved_mm) if moved_mm.any() else chart
 
 
@@ -49,7 +49,7 @@ def _moved_mm(chart: Chart, edge: int, place_mm: Floats) -> Floats:
     here_mm = near_mm[np.abs(height_mm) <= HERE_MM]
     if not _better(chart, edge, here_mm, float(push_mm[chart.here])):
         return np.zeros_like(chart.nodes_mm)
-    stands_mm = np.stack([_behind_mm(chart, edge, _at(nodes, z)) for nodes, z in _layers(chart)])
+    stands_mm = (chart.nodes_mm - chart.nodes_mm[:, edge][:, None]) @ _inward(chart, edge)
     shares = np.clip(1.0 - stands_mm / REACH_MM, 0.0, 1.0) ** 2
     return np.asarray((push_mm[:, None] * shares)[:, :, None] * _inward(chart, edge))
 
@@ -100,11 +100,3 @@ def _inward(chart: Chart, edge: int) -> Floats:
     """The direction (2,) along the chord from an edge to the other one."""
     chord = chart.curve_mm[(edge + NODES // 2) % NODES] - chart.curve_mm[edge]
     return np.asarray(chord / np.linalg.norm(chord))
-
-
-def _layers(chart: Chart) -> list[tuple[Floats, float]]:
-    return list(zip(chart.nodes_mm, chart.z_mm.tolist(), strict=True))
-
-
-def _at(nodes_mm: Floats, z_mm: float) -> Floats:
-    return np.column_stack([nodes_mm, np.full(len(nodes_mm), z_mm)])
