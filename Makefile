@@ -59,6 +59,7 @@ bench-parts: setup  ## whole parts from views to patches: occlusion, real blades
 bench-verdicts: setup  ## the whole product from files: verdicts of random parts against the truth; none may be wrong
 	$(BIN)/python -m benchmarks.verdicts 20
 	$(BIN)/python -m benchmarks.verdicts 6 --real
+	$(BIN)/python -m benchmarks.verdicts 6 --real --rework
 
 campaign: setup  ## hours: every registration cloud, 1,000 random poses a scenario, all seeds of the twin
 	$(BIN)/python -m benchmarks.registration --full

@@ -1,6 +1,6 @@
 """Verdicts of the whole product against the truth: random parts, scanned, inspected from their files.
 
-    python -m benchmarks.verdicts [parts] [first seed] [--real]
+    python -m benchmarks.verdicts [parts] [first seed] [--real] [--rework]
 
 Each part is a blade worn at random, from half to three times what the presets allow, with up to three
 damages whose sizes are drawn on a logarithmic scale across both limits of their zone, so that many true
@@ -10,6 +10,9 @@ where the scan has a larger gap than the plan allows, it is SCRAP or HOLD.
 
 With `--real` the nominals are a turbine blade and two compressor rows in turn, where their geometry is
 here; sizes go with the chord.
+
+With `--rework` parts have metal put on and bent as well: beads on a side and on the leading edge, a bent
+corner of the tip.
 
 HOLD is always allowed: near a limit it is the only honest word. Its reasons are listed, with how far the
 truth lies from the limit that it is nearest to, in shares of that limit. Any other word that is not the
@@ -26,6 +29,8 @@ from pathlib import Path
 
 import numpy as np
 
+from simulators.beads import edge_bead, side_bead
+from simulators.bends import Bend
 from simulators.blade import Wear
 from simulators.cutters import Cut, edge_nick, eroded_edge, pit, tip_corner
 from simulators.optics import OpticsSettings
@@ -59,17 +64,21 @@ class Judged:
         return self.word not in (self.truth, "HOLD")
 
 
-def random_part(blade: NominalBlade, seed: int) -> SimPart:
+def random_part(blade: NominalBlade, seed: int, rework: bool = False) -> SimPart:
     """A part with wear and damages of any size that a plan is about."""
-    rng = np.random.default_rng([seed, 11])
+    rng, more = np.random.default_rng([seed, 11]), np.random.default_rng([seed, 13])
     size = recipe_of(blade).scale
     worn = worn_blade(blade, random_wear(rng, size))
     while True:
+        cuts = random_cuts(worn, rng, size)
+        beads = random_beads(worn, more, size) if rework else []
+        bends = random_bends(more, size) if rework and all(cut.zone != "tip" for cut in cuts) else []
         try:
             return assemble(
                 blade,
                 worn,
-                random_cuts(worn, rng, size),
+                cuts + beads,
+                bends,
                 preset="random",
                 serial=serial_of(seed, 0),
                 seed=seed,
@@ -113,13 +122,34 @@ def random_cuts(worn: WornBlade, rng: np.random.Generator, size: float) -> list[
     return [makers[kind](depth_mm) for kind, depth_mm in chosen.items()]
 
 
+def random_beads(worn: WornBlade, rng: np.random.Generator, size: float) -> list[Cut]:
+    """Either kind with a chance of two in five, off the other damages."""
+    heights = [size * logarithmic(rng, 0.1, 3.0) if rng.random() < 0.4 else 0.0 for _ in range(2)]
+    radii = [size + height for height in heights]
+    beads = []
+    if heights[0]:
+        at = rng.uniform(0.25, 0.7), rng.uniform(0.3, 0.7)
+        beads.append(side_bead(worn.airfoil, *at, heights[0], radii[0]))
+    if heights[1]:
+        beads.append(edge_bead(worn.airfoil, "leading_edge", rng.uniform(0.8, 0.88), heights[1], radii[1]))
+    return beads
+
+
+def random_bends(rng: np.random.Generator, size: float) -> list[Bend]:
+    """A bent corner every other time."""
+    if rng.random() < 0.5:
+        return []
+    length_mm, depth_mm = size * rng.uniform(5.0, 15.0), logarithmic(rng, 0.1, 3.0)
+    return [Bend(length_mm=length_mm, chord_fraction=rng.uniform(0.5, 0.8), depth_mm=depth_mm)]
+
+
 def logarithmic(rng: np.random.Generator, least: float, most: float) -> float:
     return float(np.exp(rng.uniform(np.log(least), np.log(most))))
 
 
-def judged(blade: NominalBlade, seed: int, folder: Path) -> Judged:
+def judged(blade: NominalBlade, seed: int, folder: Path, rework: bool) -> Judged:
     """The part of a seed, inspected from its files in `folder`."""
-    part = random_part(blade, seed)
+    part = random_part(blade, seed, rework)
     truth = write_scanned(folder, blade, part, VIEWS, seed)
     started_s = time.process_time()
     inspection = inspect_scan(
@@ -169,6 +199,7 @@ def main() -> int:
     arguments.add_argument("parts", type=int, nargs="?", default=6)
     arguments.add_argument("first", type=int, nargs="?", default=0)
     arguments.add_argument("--real", action="store_true")
+    arguments.add_argument("--rework", action="store_true")
     asked = arguments.parse_args()
     blades = nominals(asked.real)
     if not blades:
@@ -178,7 +209,7 @@ def main() -> int:
     print(f"{'seed':>5} {'truth':7}{'word':7} {'clear %':>7} {'mm3':>8}  why, where it is not the truth")
     for seed in range(asked.first, asked.first + asked.parts):
         with tempfile.TemporaryDirectory() as folder:
-            done.append(judged(blades[seed % len(blades)], seed, Path(folder)))
+            done.append(judged(blades[seed % len(blades)], seed, Path(folder), asked.rework))
         part = done[-1]
         why = "" if part.word == part.truth else "; ".join(part.reasons[:2])
         print(

@@ -15,6 +15,7 @@ from simulators.solids import Floats, Ints, Solid
 
 ZoneName = Literal["tip", "leading_edge", "trailing_edge", "surface"]
 EdgeName = Literal["leading_edge", "trailing_edge"]
+SideName = Literal["suction", "pressure"]
 Relief = Callable[[Floats, Floats], Floats]  # (u, v) -> how far inward the fracture lies
 WAVES = 9  # of a rough surface
 BLUNT = 0.045  # radius of an eroded edge, of the chord, at least
@@ -24,10 +25,11 @@ WIDE = 0.1  # how far an eroded edge may reach to either side, of the chord
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Cut:
-    """One cutter: a closed solid, and the zone in which its damage counts."""
+    """One cutter: a closed solid, and the zone in which its damage counts. `adds`: its metal is put on."""
 
     zone: ZoneName
     cutter: Solid
+    adds: bool = False
 
 
 def tip_corner(airfoil: Airfoil, depth_mm: float, chord_fraction: float, rng: np.random.Generator) -> Cut:
@@ -168,7 +170,7 @@ def pit(
     rng: np.random.Generator,
 ) -> Cut:
     """A void on the pressure side: a rough spherical cap, about `depth_mm` deep along the normal."""
-    centre, along, across, outward = _pressure_frame(airfoil, span_fraction, chord_fraction)
+    centre, along, across, outward = side_frame(airfoil, "pressure", span_fraction, chord_fraction)
     sphere_mm = (radius_mm**2 + depth_mm**2) / (2.0 * depth_mm)
     rough = _roughness(rng, 0.05 * depth_mm, radius_mm)
 
@@ -193,23 +195,22 @@ def pit(
     )
 
 
-def _pressure_frame(
-    airfoil: Airfoil, span_fraction: float, chord_fraction: float
+def side_frame(
+    airfoil: Airfoil, side: SideName, span_fraction: float, chord_fraction: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """A point on the pressure side, two tangents and the outward normal there."""
+    """A point on a side, two tangents, the first along the chord, and the outward normal there."""
+
+    def at(z_mm: float, fraction: float) -> Floats:
+        frame = airfoil.frame(z_mm)
+        return frame.suction_point_mm(fraction) if side == "suction" else frame.pressure_point_mm(fraction)
+
     z_mm, step = airfoil.height_mm(span_fraction), 0.01 * airfoil.span_mm
-    frame = airfoil.frame(z_mm)
-    centre = frame.pressure_point_mm(chord_fraction)
-    chordwise = frame.pressure_point_mm(chord_fraction + 0.02) - frame.pressure_point_mm(
-        chord_fraction - 0.02
-    )
-    spanwise = airfoil.frame(z_mm + step).pressure_point_mm(chord_fraction) - airfoil.frame(
-        z_mm - step
-    ).pressure_point_mm(chord_fraction)
+    chordwise = at(z_mm, chord_fraction + 0.02) - at(z_mm, chord_fraction - 0.02)
+    spanwise = at(z_mm + step, chord_fraction) - at(z_mm - step, chord_fraction)
     normal = _unit(np.cross(chordwise, spanwise))
-    inward = np.append(frame.toward_suction, 0.0)
+    outward = np.append(airfoil.frame(z_mm).toward_suction, 0.0) * (1.0 if side == "suction" else -1.0)
     along = _unit(chordwise)
-    return centre, along, np.cross(normal, along), -normal * np.sign(normal @ inward)
+    return at(z_mm, chord_fraction), along, np.cross(normal, along), normal * np.sign(normal @ outward)
 
 
 def _edge(airfoil: Airfoil, zone: EdgeName, z_mm: float) -> tuple[Floats, Floats]:

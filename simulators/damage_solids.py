@@ -1,12 +1,13 @@
-"""Damage as exact solid subtraction, with the volume and depth of each.
+"""Damage as exact solid subtraction or addition, with the volume and depth of each.
 
-What a cutter removes is its intersection with the blade, so volume and depth belong to the very mesh that
-is scanned.
+What a cutter removes is its intersection with the blade, and what it adds is the rest of it, so volume and
+depth belong to the very mesh that is scanned.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import Literal
 
 import manifold3d
 import numpy as np
@@ -26,16 +27,18 @@ class DamageTruth:
     """One damage as it was made, nominal frame."""
 
     zone: ZoneName
-    volume_mm3: float
+    kind: Literal["missing", "excess", "deformation"] = "missing"
+    volume_mm3: float  # 0 of metal that is bent
     depth_mm: float
-    area_mm2: float  # of the lost skin
+    area_mm2: float  # of the lost, covered or bent skin
     centroid_mm: tuple[float, float, float]
     z_low_mm: float
     z_high_mm: float
 
     def __post_init__(self) -> None:
-        if not (isfinite(self.depth_mm) and self.depth_mm > 0.0 and self.volume_mm3 > 0.0):
-            raise NotASolid(f"{self.zone}: a cutter that removes nothing")
+        changed = self.volume_mm3 > 0.0 or self.kind == "deformation"
+        if not (isfinite(self.depth_mm) and self.depth_mm > 0.0 and changed):
+            raise NotASolid(f"{self.zone}: a cutter that changes nothing")
 
 
 def break_off(airfoil: Airfoil, cuts: Sequence[Cut]) -> tuple[Solid, tuple[DamageTruth, ...]]:
@@ -48,8 +51,9 @@ def break_off(airfoil: Airfoil, cuts: Sequence[Cut]) -> tuple[Solid, tuple[Damag
     for cut in cuts:
         blade = blade.as_original()
         cutter = to_manifold(cut.cutter)
-        rest = blade - cutter
-        chips.append((cut.zone, blade ^ cutter, rest, blade.original_id()))
+        rest = blade + cutter if cut.adds else blade - cutter
+        chip = cutter - blade if cut.adds else blade ^ cutter
+        chips.append((cut, chip, rest, blade.original_id()))
         blade = rest
     if len(blade.decompose()) != 1:
         raise NotASolid("a damage severs the blade")
@@ -58,19 +62,26 @@ def break_off(airfoil: Airfoil, cuts: Sequence[Cut]) -> tuple[Solid, tuple[Damag
 
 
 def _truth(
-    airfoil: Airfoil, zone: ZoneName, removed: manifold3d.Manifold, rest: manifold3d.Manifold, blade_id: int
+    airfoil: Airfoil, cut: Cut, changed: manifold3d.Manifold, rest: manifold3d.Manifold, blade_id: int
 ) -> DamageTruth:
-    if removed.is_empty():
-        raise NotASolid(f"{zone}: the cutter misses the blade")
-    chip = from_manifold(removed)
-    skin = _faces_from(removed, blade_id)
+    """The truth of the metal that a cutter took or added, beside what the blade is afterwards."""
+    skin = _faces_from(changed, blade_id)
+    if not len(skin):
+        raise NotASolid(f"{cut.zone}: the cutter misses the blade")
+    chip = from_manifold(changed)
+    skin_mm = chip.vertices_mm[chip.faces[skin]]
     fracture = chip.vertices_mm[np.unique(np.delete(chip.faces, skin, axis=0))]
     heights = chip.vertices_mm[:, 2]
+    if cut.adds:
+        depth_mm = farthest_apart_mm(skin_mm, fracture)
+    else:
+        depth_mm = _depth_mm(airfoil, cut.zone, rest, skin_mm, fracture)
     return DamageTruth(
-        zone=zone,
-        volume_mm3=float(removed.volume()),
-        depth_mm=_depth_mm(airfoil, zone, rest, chip.vertices_mm[chip.faces[skin]], fracture),
-        area_mm2=_area_mm2(chip.vertices_mm[chip.faces[skin]]),
+        zone=cut.zone,
+        kind="excess" if cut.adds else "missing",
+        volume_mm3=float(changed.volume()),
+        depth_mm=depth_mm,
+        area_mm2=_area_mm2(skin_mm),
         centroid_mm=_centroid_mm(chip),
         z_low_mm=float(heights.min()),
         z_high_mm=float(heights.max()),
@@ -117,11 +128,18 @@ def _normal_depth_mm(skin_mm: Floats, fracture_mm: Floats) -> float:
     axis = np.linalg.eigh((cross / np.maximum(area, 1e-300)[:, None]).T @ cross)[1][:, -1]
     above = cross @ axis > 0.0
     larger = above if area[above].sum() >= area[~above].sum() else ~above
-    return _depth_below_mm(skin_mm[larger], fracture_mm)
+    return _farthest_mm(skin_mm[larger], fracture_mm, _below_mm)
 
 
-def _depth_below_mm(skin_mm: Floats, fracture_mm: Floats) -> float:
-    """Along the normal of the skin next to it: beside the rim a point is far from the skin, but not deep.
+def farthest_apart_mm(skin_mm: Floats, points_mm: Floats) -> float:
+    """The largest distance of points (n, 3) from the skin (m, 3, 3)."""
+    return _farthest_mm(skin_mm, points_mm, _apart_mm)
+
+
+def _farthest_mm(
+    skin_mm: Floats, fracture_mm: Floats, distances_mm: Callable[[Floats, Floats], Floats]
+) -> float:
+    """The largest of the distances of the points from the skin (m, 3, 3).
 
     No point is deeper than it is far from the middle of a triangle: those that are no farther than the
     deepest so far need no closer look.
@@ -133,19 +151,30 @@ def _depth_below_mm(skin_mm: Floats, fracture_mm: Floats) -> float:
         some = order[first : first + AT_ONCE]
         if farthest_mm[some[0]] <= deepest_mm:
             break
-        deepest_mm = max(deepest_mm, float(_below_mm(skin_mm, fracture_mm[some]).max()))
+        deepest_mm = max(deepest_mm, float(distances_mm(skin_mm, fracture_mm[some]).max()))
     return deepest_mm
 
 
 def _below_mm(skin_mm: Floats, points_mm: Floats) -> Floats:
-    """Distances (n,) of points along the normal of the triangle (m, 3, 3) that is nearest to each."""
+    """Distances (n,) of points along the normal of the triangle (m, 3, 3) that is nearest to each: beside the
+    rim a point is far from the skin, but not deep."""
+    nearest, gaps = _nearest(skin_mm, points_mm)
+    normals = _cross(skin_mm[nearest])
+    return np.asarray(np.abs((gaps * normals).sum(axis=1)) / np.linalg.norm(normals, axis=1))
+
+
+def _apart_mm(skin_mm: Floats, points_mm: Floats) -> Floats:
+    """Distances (n,) of points from the triangles (m, 3, 3)."""
+    return np.asarray(np.linalg.norm(_nearest(skin_mm, points_mm)[1], axis=1))
+
+
+def _nearest(skin_mm: Floats, points_mm: Floats) -> tuple[Ints, Floats]:
+    """The triangle (m, 3, 3) nearest to each point (n,), and the way (n, 3) to it."""
     triangles_mm = np.repeat(skin_mm[None], len(points_mm), axis=0).reshape(-1, 3, 3)
     points = np.repeat(points_mm, len(skin_mm), axis=0)
     gaps = (trimesh.triangles.closest_point(triangles_mm, points) - points).reshape(len(points_mm), -1, 3)
     nearest = np.linalg.norm(gaps, axis=2).argmin(axis=1)
-    normals = _cross(skin_mm[nearest])
-    along = (gaps[np.arange(len(points_mm)), nearest] * normals).sum(axis=1)
-    return np.asarray(np.abs(along) / np.linalg.norm(normals, axis=1))
+    return nearest, gaps[np.arange(len(points_mm)), nearest]
 
 
 def _cross(triangles_mm: Floats) -> Floats:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from simulators.bends import Bend, bent
 from simulators.cutters import Cut
 from simulators.damage_solids import DamageTruth, break_off
 from simulators.optics import OpticsSettings, StructuredLight
@@ -57,7 +58,7 @@ class SimPart:
         return {
             "verdict": decide(self.judged, stranger=not self.judged, hidden=hidden),
             "T_nominal_scan": inverse(self.T_table_part).tolist(),
-            "removed_mm3": sum(damage.volume_mm3 for damage in self.damages),
+            "removed_mm3": sum(damage.volume_mm3 for damage in self.damages if damage.kind == "missing"),
             "damages": [asdict(damage) for damage in self.damages],
             "sections": [_section_row(section) for section in self.sections],
             "noise_normal_mm": self.optics.noise_normal_mm,
@@ -90,6 +91,7 @@ def assemble(
     blade: NominalBlade,
     worn: WornBlade,
     cuts: Sequence[Cut],
+    bends: Sequence[Bend] = (),
     *,
     preset: str,
     serial: str,
@@ -97,8 +99,13 @@ def assemble(
     optics: OpticsSettings,
     rng: np.random.Generator,
 ) -> SimPart:
-    """The part of a worn blade with the cuts made, clamped with a play drawn from `rng`."""
-    solid, damages = break_off(worn.airfoil, cuts)
+    """The part of a worn blade bent and with the cuts made, clamped with a play drawn from `rng`."""
+    folds: list[DamageTruth] = []
+    for bend in bends:
+        worn, fold = bent(blade, worn, bend)
+        folds.append(fold)
+    solid, changes = break_off(worn.airfoil, cuts)
+    damages = (*changes, *folds)
     recipe = recipe_of(blade)
     sections = section_truths(blade, worn, recipe.section_z_mm)
     return SimPart(

@@ -1,7 +1,16 @@
 """What the presets are called; apart from their making, so that a wrong name is refused at once."""
 
 DEMO = ("PASS", "REPAIR", "SCRAP")
-PRESETS = ("PASS", "PASS-nick", "REPAIR", "SCRAP", "HOLD-hole", "HOLD-wrong-part")
+PRESETS = (
+    "PASS",
+    "PASS-nick",
+    "REPAIR",
+    "REPAIR-weld",
+    "REPAIR-bent",
+    "SCRAP",
+    "HOLD-hole",
+    "HOLD-wrong-part",
+)
 
 
 def preset_named(text: str) -> str:

@@ -12,6 +12,8 @@ from zlib import crc32
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from simulators.beads import side_bead
+from simulators.bends import Bend
 from simulators.blade import BladeShape, Wear, blade_solid
 from simulators.cutters import Cut, edge_nick, pit, tip_corner
 from simulators.optics import BlindSpot, OpticsSettings
@@ -73,8 +75,9 @@ def make_part(blade: NominalBlade, preset: str, seed: int, index: int = 0) -> Si
         return _wrong_part(blade, serial, seed, rng)
     worn = worn_blade(blade, service_wear(blade, rng))
     optics = OpticsSettings(blind=(_dirt(blade, worn, rng),) if preset == "HOLD-hole" else ())
+    bends = (bent_corner(blade, rng),) if preset == "REPAIR-bent" else ()
     cuts = CUTS[preset](blade, worn, rng) if preset in CUTS else []
-    return assemble(blade, worn, cuts, preset=preset, serial=serial, seed=seed, optics=optics, rng=rng)
+    return assemble(blade, worn, cuts, bends, preset=preset, serial=serial, seed=seed, optics=optics, rng=rng)
 
 
 def serial_of(seed: int, index: int) -> str:
@@ -125,6 +128,19 @@ def corner_and_pit(blade: NominalBlade, worn: WornBlade, rng: np.random.Generato
     return broken_corner(blade, worn, rng) + pits
 
 
+def weld_bead(blade: NominalBlade, worn: WornBlade, rng: np.random.Generator) -> CutList:
+    """The bead of an old weld on the suction side, to be taken off."""
+    s = blade.scale
+    height, radius = rng.uniform(0.7, 1.1) * s, rng.uniform(2.5, 3.0) * s
+    return [side_bead(worn.airfoil, rng.uniform(0.25, 0.5), rng.uniform(0.4, 0.6), height, radius)]
+
+
+def bent_corner(blade: NominalBlade, rng: np.random.Generator) -> Bend:
+    """The corner of tip and trailing edge, bent beyond the serviceable limit of form."""
+    length_mm = rng.uniform(10.0, 14.0) * blade.scale
+    return Bend(length_mm=length_mm, chord_fraction=rng.uniform(0.6, 0.7), depth_mm=rng.uniform(0.6, 0.7))
+
+
 def beyond_repair(blade: NominalBlade, worn: WornBlade, rng: np.random.Generator) -> CutList:
     """A nick or a corner that is deeper than anybody may repair."""
     s = blade.scale
@@ -137,6 +153,7 @@ def beyond_repair(blade: NominalBlade, worn: WornBlade, rng: np.random.Generator
 CUTS: dict[str, CutMaker] = {
     "PASS-nick": shallow_nick,
     "REPAIR": corner_and_pit,
+    "REPAIR-weld": weld_bead,
     "SCRAP": beyond_repair,
 }
 

@@ -139,7 +139,9 @@ class Finding:
 def findings(
     recipe: Recipe, sections: Sequence[SectionTruth], damages: Sequence[DamageTruth], form_mm: float
 ) -> list[Finding]:
-    """Everything that a perfect measurement would judge: form, sections that no damage touches, damages."""
+    """Everything that a perfect measurement would judge: form with its bends, sections that no other damage
+    touches, damages."""
+    damages = [damage for damage in damages if damage.kind != "deformation"]
     found = [_finding("form.deviation_mm", form_mm, FORM_LIMITS["deviation_mm"])]
     for section in sections:
         if not any(damage.z_low_mm <= section.z_mm <= damage.z_high_mm for damage in damages):

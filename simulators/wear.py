@@ -22,7 +22,8 @@ MODES = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WornBlade:
-    """The undamaged blade after service, nominal frame. `form_mm`: largest deviation along the normal."""
+    """The undamaged blade after service, nominal frame. `form_mm`: largest deviation along the normal, of
+    metal that is bent its largest distance."""
 
     airfoil: Airfoil
     section: Section
