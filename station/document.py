@@ -187,6 +187,7 @@ def damage_of(damage: Damage) -> Json:
         "remaining_chord_mm": damage.remaining_chord_mm,
         "above_root_mm": damage.above_root_mm,
         "spacing_mm": damage.spacing_mm,
+        "off_nominal_mm": damage.off_nominal_mm,
     }
     return {
         "zone": damage.zone.value,

@@ -175,9 +175,9 @@ def blade_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Findin
 
 
 def form_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Finding]:
-    """The finding of the twin against the nominal, or of metal bent farther off the twin, if limited."""
+    """The finding of the twin against the nominal, or of metal bent farther off it, if limited."""
     limit, name = plan.limits.form.deviation_mm, "form.deviation_mm"
-    match limit, largest(measurement.form_mm, *(damage.depth_mm for damage in bent(measurement))):
+    match limit, largest(measurement.form_mm, *(damage.off_nominal_mm for damage in bent(measurement))):
         case Limit(), Measurand(value=value, sigma=sigma):
             yield measured_finding(name, limit, value, plan.measurement.coverage_factor * sigma, 0.0)
         case Limit(), NotMeasured(reason=reason):

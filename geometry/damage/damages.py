@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import ZONE_ORDER, Nominal
-from geometry.damage.bends import BendSettings, bend_depth, bent_pairs
+from geometry.damage.bends import BendSettings, bend_depth, bend_off_nominal, bent_pairs
 from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, reaches_edge, span_depth
 from geometry.damage.detection import edge_limit_mm, tip_limit_mm
+from geometry.damage.excess import excess_volume
 from geometry.damage.normal_depth import normal_depth
 from geometry.damage.regions import (
     Field,
@@ -30,6 +31,7 @@ from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotM
 PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
 NOT_AN_EDGE = NotMeasured(reason="no loss of an edge")
 NOT_SOUGHT = NotMeasured(reason="was not looked for")
+NOT_BENT = NotMeasured(reason="not bent")
 ALONE = NotMeasured(reason="no other damage")
 HOLLOW_SPACINGS = 12.0  # width of the hollow, in point spacings, that the detection limit is stated for
 KEPT = 0.8  # of the depth of such a hollow is left in the mean over a neighbourhood
@@ -62,6 +64,7 @@ class Damage:
     remaining_chord_mm: Measured = NOT_AN_EDGE  # least, of a section there
     above_root_mm: Measured = NOT_SOUGHT  # its lowest point over z_min
     spacing_mm: Measured = ALONE  # straight to the nearest other damage
+    off_nominal_mm: Measured = NOT_BENT  # how far bent metal lies off the nominal, which limits of form judge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +93,7 @@ def find_damages(
     regions = find_regions(found, nominal, settings.regions)
     bent, single = bent_pairs(regions, found, nominal, settings.bends)
     damages = [_described(region, found, nominal, twin, settings) for region in single]
-    damages += [_bent(a, b, found, nominal, settings) for a, b in bent]
+    damages += [_bent(a, b, found, nominal, alignment, settings) for a, b in bent]
     return _spaced(damages, found)
 
 
@@ -137,7 +140,7 @@ def _described(
         kind=DamageKind.MISSING if region.missing else DamageKind.EXCESS,
         depth_mm=loss.depth_mm,
         area_mm2=_area(region, found, nominal),
-        volume_mm3=_volume(region, found),
+        volume_mm3=_volume(region, found) if region.missing else excess_volume(region, found, twin),
         length_mm=_length_mm(body_mm),
         span_mm=_span_mm(region, found),
         centroid_mm=body_mm.mean(axis=0),
@@ -195,7 +198,12 @@ def _spaced(damages: list[Damage], found: Field) -> tuple[Damage, ...]:
 
 
 def _bent(
-    missing: Region, excess: Region, found: Field, nominal: Nominal, settings: DamageSettings
+    missing: Region,
+    excess: Region,
+    found: Field,
+    nominal: Nominal,
+    alignment: Alignment,
+    settings: DamageSettings,
 ) -> Damage:
     """The damage of a bent region, from both its sides."""
     points = np.sort(np.concatenate([missing.points, excess.points]))
@@ -211,6 +219,7 @@ def _bent(
         span_mm=_span_mm(both, found),
         centroid_mm=found.scan_mm[points].mean(axis=0),
         points=points,
+        off_nominal_mm=bend_off_nominal(both, found, nominal, alignment),
     )
 
 

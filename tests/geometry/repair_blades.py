@@ -236,7 +236,7 @@ class Specimen:
     cloud: Cloud
     alignment: Alignment
     damages: tuple[Damage, ...]
-    removed_mm3: tuple[float, ...]
+    removed_mm3: tuple[float, ...]  # or put on
     damaged: Mesh
     on_break: NDArray[np.int64]  # (points,) number of the damage that the point lies on, -1 none
 
@@ -265,8 +265,9 @@ def specimen(
     per_mm2: float = 25.0,
     pitch_mm: float = 0.35,
     z_from_mm: float = 0.0,
+    adds: bool = False,
 ) -> Specimen:
-    """A blade cut by `cutters`, scanned at random with Gaussian noise along the normal."""
+    """A blade cut by `cutters`, or with these put on, scanned at random with noise along the normal."""
     mesh = blade_mesh(pitch_mm)
     whole = solid_of(mesh).as_original()
     rest, removed = whole, []
@@ -274,8 +275,8 @@ def specimen(
     for number, tool in enumerate(cutters.values()):
         cutter = tool.as_original()
         marks[cutter.original_id()] = number
-        removed.append(float((rest ^ cutter).volume()))
-        rest = rest - cutter
+        removed.append(float((cutter - rest if adds else rest ^ cutter).volume()))
+        rest = rest + cutter if adds else rest - cutter
     damaged = mesh_of(rest)
     points, normals, face = _sampled(damaged, per_mm2, rng)
     on_break = _marks(rest, marks)[face]

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.damage.damages import Damage, DamageKind, find_damages
-from geometry.types import Floats, Measurand, Zone
+from geometry.types import Floats, Measurand, NotMeasured, Zone
 from tests.geometry import repair_blades as blades
 
 NOISE_MM = 0.012
@@ -61,6 +61,28 @@ def test_both_sides_of_bent_metal_are_one_deformation(shape, zone: Zone, bend_mm
     assert isinstance(bend.depth_mm, Measurand)
     assert 0.65 * abs(bend_mm) < bend.depth_mm.value < abs(bend_mm) + 2.0 * bend.depth_mm.sigma
     assert bend.span_mm[0] < scanned().cloud.points_mm[np.argmax(sheet), 2] < bend.span_mm[1] + 0.5
+
+
+@pytest.mark.parametrize("bend_mm", [-0.09, 0.09, 0.12])
+@pytest.mark.parametrize(("shape", "zone"), [(curled, Zone.LEADING_EDGE), (corner, Zone.TIP)])
+def test_metal_bent_a_little_is_no_loss(shape, zone: Zone, bend_mm: float) -> None:
+    """One side stands off enough to be found, the other a little less."""
+    sheet = shape(scanned().cloud.points_mm)
+    (bend,) = told(scanned(), np.outer(bend_mm * sheet, [0.0, 1.0, 0.0]))
+    assert (bend.kind, bend.zone) == (DamageKind.DEFORMATION, zone)
+    assert isinstance(bend.off_nominal_mm, Measurand)
+    assert bend.off_nominal_mm.value == pytest.approx(abs(bend_mm), abs=2.0 * bend.off_nominal_mm.sigma)
+
+
+@pytest.mark.parametrize("depth_mm", [0.08, 0.15, 0.4])
+def test_a_shallow_pit_is_no_bend(depth_mm: float) -> None:
+    """The other side of its metal is where it was."""
+    shallow = blades.specimen(
+        {Zone.SURFACE: blades.pit_cutter(depth_mm, 9.0)}, NOISE_MM, np.random.default_rng(1), 25.0
+    )
+    (pit,) = told(shallow, np.zeros(3))
+    assert (pit.kind, pit.zone) == (DamageKind.MISSING, Zone.SURFACE)
+    assert isinstance(pit.off_nominal_mm, NotMeasured)
 
 
 @pytest.mark.parametrize("burr_mm", [0.15, 0.8])

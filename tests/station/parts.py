@@ -116,6 +116,7 @@ def damage(
     kind: DamageKind = DamageKind.MISSING,
     depth: Measured | float = 8.0,
     volume: Measured | float = 60.0,
+    off_nominal: Measured = NotMeasured(reason="not bent"),
 ) -> Damage:
     """One damage with these sizes."""
     return Damage(
@@ -128,6 +129,7 @@ def damage(
         span_mm=(95.0, 105.0),
         centroid_mm=np.array([1.0, 2.0, 100.0]),
         points=np.arange(3),
+        off_nominal_mm=off_nominal,
     )
 
 

@@ -327,11 +327,19 @@ def test_any_parameter_of_a_section_can_be_limited() -> None:
 
 
 @pytest.mark.parametrize(("depth", "word"), [(0.1, Word.PASS), (0.3, Word.REPAIR), (0.9, Word.SCRAP)])
-def test_bent_metal_is_judged_by_the_limits_of_form(depth: float, word: Word) -> None:
-    bent = damage(kind=DamageKind.DEFORMATION, depth=depth, volume=999.0)
+def test_bent_metal_is_judged_by_how_far_it_is_off_the_nominal(depth: float, word: Word) -> None:
+    """The twin follows a bend a part of its way: what is left between them is no measure of it."""
+    bent = damage(
+        kind=DamageKind.DEFORMATION, depth=0.05, volume=999.0, off_nominal=number("off_nominal_mm", depth)
+    )
     done = verdict(damages=(bent,))
     assert done.verdict == word
     assert not done.patches
+
+
+def test_bent_metal_that_could_not_be_measured_holds() -> None:
+    bent = damage(kind=DamageKind.DEFORMATION, off_nominal=lost("no point is left"))
+    assert verdict(damages=(bent,)).reasons == ("form: deviation: no point is left",)
 
 
 def test_bent_metal_without_a_limit_of_form_needs_a_limited_section_on_it() -> None:
