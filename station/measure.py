@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
 from geometry.coverage import measure_coverage
-from geometry.damage.damages import Damage, DamageKind, DamageSettings, detection_limit, find_damages
+from geometry.damage.damages import Damage, DamageKind, detection_limit, find_damages
 from geometry.deformation.twin import Twin
 from geometry.errors import CannotMeasure
 from geometry.registration.alignment import Alignment
@@ -84,8 +84,8 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
     alignment = aligned.alignment if aligned else None
     mask = run.step("mask", mask_damage, points, alignment, nominal)
     twin = run.step("twin", make_twin, points, mask, alignment, recipe)
-    damages = run.step("damage", find_damages, points, mask, alignment, nominal, twin, DamageSettings())
-    detection = run.step("detection", detection_limit, points, twin, DamageSettings())
+    damages = run.step("damage", find_damages, points, mask, alignment, nominal, twin, recipe.damage_settings)
+    detection = run.step("detection", detection_limit, points, twin, recipe.damage_settings)
     repairs = run.step("repair", find_repairs, twin, points, alignment, damages, recipe.repair_settings)
     sections = run.step(
         "sections", inspected, points, mask, alignment, recipe, twin=twin, damages=damages, repairs=repairs

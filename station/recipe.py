@@ -10,6 +10,7 @@ import numpy as np
 from geometry.blade.nominal import Nominal, NominalSettings, prepare_nominal
 from geometry.blade.read import read_nominal
 from geometry.coverage import CoverageSettings
+from geometry.damage.damages import DamageSettings
 from geometry.errors import BadInput
 from geometry.registration.datums import DatumSettings
 from geometry.repair.patches import RepairSettings
@@ -51,6 +52,10 @@ class Recipe:
                 locked=frozenset(wanted.fit.locked),
             ),
         )
+
+    @property
+    def damage_settings(self) -> DamageSettings:
+        return DamageSettings(max_gap_mm=self.plan.coverage.max_gap_mm)
 
     @property
     def repair_settings(self) -> RepairSettings:

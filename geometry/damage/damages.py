@@ -71,6 +71,7 @@ class Damage:
 class DamageSettings:
     regions: RegionSettings = field(default_factory=RegionSettings)
     bends: BendSettings = field(default_factory=BendSettings)
+    max_gap_mm: float = 1.5  # a larger hole in the scan of metal in excess leaves its volume open
     touching: float = 0.03  # share of a damage that must lie in a zone for the damage to touch it
 
 
@@ -140,7 +141,7 @@ def _described(
         kind=DamageKind.MISSING if region.missing else DamageKind.EXCESS,
         depth_mm=loss.depth_mm,
         area_mm2=_area(region, found, nominal),
-        volume_mm3=_volume(region, found) if region.missing else excess_volume(region, found, twin),
+        volume_mm3=_volume(region, found, twin, settings),
         length_mm=_length_mm(body_mm),
         span_mm=_span_mm(region, found),
         centroid_mm=body_mm.mean(axis=0),
@@ -249,8 +250,10 @@ def _area(region: Region, found: Field, nominal: Nominal) -> Measurand:
     return Measurand(name="area", value=float(value), sigma=float(strip_mm2), unit="mm2")
 
 
-def _volume(region: Region, found: Field) -> Measured:
-    """Volume between the points and the twin where the points lie close under or over the skin."""
+def _volume(region: Region, found: Field, twin: Twin, settings: DamageSettings) -> Measured:
+    """Volume between the points and the twin: of metal in excess, or missing close under the skin."""
+    if not region.missing:
+        return excess_volume(region, found, twin, settings.max_gap_mm)
     if len(region.lost):
         return NotMeasured(reason="from its patch")
     depth_mm = np.abs(found.smooth_mm[region.points])

@@ -41,12 +41,13 @@ class _Surface:
         return float((self.spacing_mm**2).sum())
 
 
-def excess_volume(region: Region, found: Field, twin: Twin) -> Measured:
+def excess_volume(region: Region, found: Field, twin: Twin, max_gap_mm: float) -> Measured:
     """Volume (mm3) of a region of metal in excess: what lies outside the twin and below the region's points.
 
     Counted on a grid, whose nodes at either surface count in part. The surface is a blend of local quadrics
     near the points; farther off, what it and the covered skin wind round counts. What nothing closes off, for
-    the scan has a hole there, is counted by halves and stated as uncertainty.
+    the scan has a hole there, is counted by halves and stated as uncertainty; as much as half a ball of the
+    permitted gap, and the metal was not seen.
     """
     skin = skin_of(twin.mesh)
     try:
@@ -54,6 +55,8 @@ def excess_volume(region: Region, found: Field, twin: Twin) -> Measured:
     except CannotRepair:
         return NotMeasured(reason="metal in excess does not show which way is out")
     volume_mm3, open_mm3 = _between(surface, found.spacing_mm, skin)
+    if open_mm3 > np.pi / 12.0 * max_gap_mm**3:
+        return NotMeasured(reason="a side of the metal in excess was not seen")
     border_mm = 2.0 * np.sqrt(np.pi * surface.area_mm2)
     sigmas_mm3 = (
         surface.area_mm2 * float(np.median(found.sigma_mm[region.points])),
