@@ -6,7 +6,7 @@ import manifold3d
 import numpy as np
 
 from simulators.airfoils import Airfoil
-from simulators.cutters import Cut, EdgeName, side_frame
+from simulators.cutters import Cut, EdgeName, edge_frame, side_frame
 from simulators.solids import Floats, Solid, from_manifold
 
 SEGMENTS = 96  # round a bead
@@ -18,7 +18,7 @@ def side_bead(
 ) -> Cut:
     """A bead on the suction side: half an ellipsoid of this height and radius."""
     top, along, across, outward = side_frame(airfoil, "suction", span_fraction, chord_fraction)
-    foot = side_frame(airfoil, "pressure", span_fraction, chord_fraction)[0]
+    foot = airfoil.frame(airfoil.height_mm(span_fraction)).pressure_point_mm(chord_fraction)
     under_mm = min(height_mm, UNDER * float(np.linalg.norm(top - foot)))
     axes_mm = np.array([radius_mm * along, radius_mm * across, height_mm * outward])
     return Cut(zone="surface", cutter=_bead(top, axes_mm, under_mm / height_mm), adds=True)
@@ -28,9 +28,7 @@ def edge_bead(
     airfoil: Airfoil, zone: EdgeName, span_fraction: float, height_mm: float, radius_mm: float
 ) -> Cut:
     """A bead round an edge, `height_mm` out of it along the chord and `radius_mm` long to either side."""
-    le, te = airfoil.edge_points_mm(airfoil.height_mm(span_fraction))
-    edge, far = (le, te) if zone == "leading_edge" else (te, le)
-    outward = (edge - far) / np.linalg.norm(edge - far)
+    edge, outward = edge_frame(airfoil, zone, airfoil.height_mm(span_fraction))
     up = np.array([0.0, 0.0, 1.0])
     axes_mm = np.array([height_mm * np.cross(up, outward), radius_mm * up, height_mm * outward])
     return Cut(zone=zone, cutter=_bead(edge, axes_mm, 2.0), adds=True)

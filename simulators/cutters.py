@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from simulators.airfoils import Airfoil, airfoil_loop
+from simulators.airfoils import Airfoil, SectionFrame, airfoil_loop
 from simulators.solids import Floats, Ints, Solid
 
 ZoneName = Literal["tip", "leading_edge", "trailing_edge", "surface"]
@@ -93,7 +93,7 @@ def edge_nick(
 
     Its flank toward the tip is the gentle one, so that a scanner that looks down sees all of it.
     """
-    edge, outward = _edge(airfoil, zone, airfoil.height_mm(span_fraction))
+    edge, outward = edge_frame(airfoil, zone, airfoil.height_mm(span_fraction))
     across = np.array([-outward[1], outward[0], 0.0])
     rough = _roughness(rng, 0.04 * depth_mm, width_mm)
     below, above = 0.3 * width_mm, 0.7 * width_mm
@@ -129,7 +129,9 @@ def eroded_edge(
     It runs out at both ends, and on both sides into the skin: the blunter, the thicker the edge.
     """
     z_mm = np.linspace(airfoil.height_mm(span_fractions[0]), airfoil.height_mm(span_fractions[1]), 241)
-    edge, outward = (np.array(rows) for rows in zip(*(_edge(airfoil, zone, z) for z in z_mm), strict=True))
+    edge, outward = (
+        np.array(rows) for rows in zip(*(edge_frame(airfoil, zone, z) for z in z_mm), strict=True)
+    )
     across = np.column_stack([outward[:, 1], -outward[:, 0], np.zeros(len(z_mm))])
     v_mm = np.linspace(-1.0, 1.0, 121) * WIDE * airfoil.chord_mm
     radius_mm = _blunt_mm(airfoil, zone, float(z_mm[len(z_mm) // 2]), depth_mm)
@@ -148,7 +150,7 @@ def eroded_edge(
 
 def _blunt_mm(airfoil: Airfoil, zone: EdgeName, z_mm: float, depth_mm: float) -> float:
     """The least radius of an edge worn back by `depth_mm` that leaves the skin on both sides: no undercut."""
-    edge, outward = _edge(airfoil, zone, z_mm)
+    edge, outward = edge_frame(airfoil, zone, z_mm)
     off = airfoil_loop(airfoil.solid, z_mm) - edge[:2]
     off = np.roll(off, -int(np.argmin(np.linalg.norm(off, axis=1))), axis=0)
     radius_mm = BLUNT * airfoil.chord_mm
@@ -200,20 +202,19 @@ def side_frame(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """A point on a side, two tangents, the first along the chord, and the outward normal there."""
 
-    def at(z_mm: float, fraction: float) -> Floats:
-        frame = airfoil.frame(z_mm)
+    def on(frame: SectionFrame, fraction: float) -> Floats:
         return frame.suction_point_mm(fraction) if side == "suction" else frame.pressure_point_mm(fraction)
 
     z_mm, step = airfoil.height_mm(span_fraction), 0.01 * airfoil.span_mm
-    chordwise = at(z_mm, chord_fraction + 0.02) - at(z_mm, chord_fraction - 0.02)
-    spanwise = at(z_mm + step, chord_fraction) - at(z_mm - step, chord_fraction)
-    normal = _unit(np.cross(chordwise, spanwise))
-    outward = np.append(airfoil.frame(z_mm).toward_suction, 0.0) * (1.0 if side == "suction" else -1.0)
+    here, above, below = (airfoil.frame(z) for z in (z_mm, z_mm + step, z_mm - step))
+    chordwise = on(here, chord_fraction + 0.02) - on(here, chord_fraction - 0.02)
+    normal = _unit(np.cross(chordwise, on(above, chord_fraction) - on(below, chord_fraction)))
     along = _unit(chordwise)
-    return at(z_mm, chord_fraction), along, np.cross(normal, along), normal * np.sign(normal @ outward)
+    outward = np.append(here.toward_suction, 0.0) * (1.0 if side == "suction" else -1.0)
+    return on(here, chord_fraction), along, np.cross(normal, along), normal * np.sign(normal @ outward)
 
 
-def _edge(airfoil: Airfoil, zone: EdgeName, z_mm: float) -> tuple[Floats, Floats]:
+def edge_frame(airfoil: Airfoil, zone: EdgeName, z_mm: float) -> tuple[Floats, Floats]:
     """The point (3,) of an edge at a height, and the unit vector (3,) along the chord out of it."""
     le, te = airfoil.edge_points_mm(z_mm)
     edge, far = (le, te) if zone == "leading_edge" else (te, le)

@@ -72,15 +72,11 @@ def _truth(
     skin_mm = chip.vertices_mm[chip.faces[skin]]
     fracture = chip.vertices_mm[np.unique(np.delete(chip.faces, skin, axis=0))]
     heights = chip.vertices_mm[:, 2]
-    if cut.adds:
-        depth_mm = farthest_apart_mm(skin_mm, fracture)
-    else:
-        depth_mm = _depth_mm(airfoil, cut.zone, rest, skin_mm, fracture)
     return DamageTruth(
         zone=cut.zone,
         kind="excess" if cut.adds else "missing",
         volume_mm3=float(changed.volume()),
-        depth_mm=depth_mm,
+        depth_mm=_depth_mm(airfoil, cut, rest, skin_mm, fracture),
         area_mm2=_area_mm2(skin_mm),
         centroid_mm=_centroid_mm(chip),
         z_low_mm=float(heights.min()),
@@ -89,15 +85,17 @@ def _truth(
 
 
 def _depth_mm(
-    airfoil: Airfoil, zone: ZoneName, rest: manifold3d.Manifold, skin_mm: Floats, fracture_mm: Floats
+    airfoil: Airfoil, cut: Cut, rest: manifold3d.Manifold, skin_mm: Floats, fracture_mm: Floats
 ) -> float:
-    if zone == "tip":
+    if cut.adds:
+        return farthest_apart_mm(skin_mm, fracture_mm)
+    if cut.zone == "tip":
         return float(airfoil.solid.vertices_mm[:, 2].max() - fracture_mm[:, 2].min())
-    if zone == "surface":
+    if cut.zone == "surface":
         return _normal_depth_mm(skin_mm, fracture_mm)
     after = from_manifold(rest)
     levels = np.linspace(fracture_mm[:, 2].min(), fracture_mm[:, 2].max(), EDGE_SLICES + 2)[1:-1]
-    return max(_edge_loss_mm(airfoil, zone, after, float(z)) for z in levels)
+    return max(_edge_loss_mm(airfoil, cut.zone, after, float(z)) for z in levels)
 
 
 def _faces_from(removed: manifold3d.Manifold, blade_id: int) -> Ints:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.damage.facing import outward_sign
-from geometry.damage.local_shape import local_quadrics, pieces, spacings_mm, thinned
+from geometry.damage.local_shape import local_quadrics, pieces, spacings_mm, thinned, turn_over
 from geometry.damage.skin import Skin
 from geometry.errors import CannotRepair
 from geometry.types import Bools, Floats, Ints
@@ -90,9 +90,7 @@ def find_broken_surface(
     lost_pitch_mm = _lost_pitch(skin, points_mm, spacing_mm)
     support_mm = min(SUPPORT * pitch_mm, 0.5 * max_gap_mm)
     lost_mm, lost_normals = _lost_skin(skin, raw_mm, sound_mm, lost_pitch_mm, support_mm)
-    inward = outward_sign(points_mm, frames[:, 2], lost_mm, lost_normals) < 0.0
-    frames[inward, 1:] *= -1.0
-    bending[np.ix_(inward, np.array([0, 2]))] *= -1.0
+    turn_over(frames, bending, outward_sign(points_mm, frames[:, 2], lost_mm, lost_normals) < 0.0)
     return BrokenSurface(
         raw_mm=raw_mm,
         sigma_mm=sigma_mm,
@@ -173,19 +171,36 @@ def _lost_skin(
     Lost is what has no sound point near it, or lies nearer to the broken surface.
     """
     margin_mm = 2.0 + float(np.linalg.norm(np.ptp(raw_mm, axis=0)))
-    points, normals = skin.samples(pitch_mm, raw_mm.min(axis=0) - margin_mm, raw_mm.max(axis=0) + margin_mm)
+    box_mm = raw_mm.min(axis=0) - margin_mm, raw_mm.max(axis=0) + margin_mm
+    samples = skin.samples(pitch_mm, *box_mm)
     touch_mm = support_mm + 2.0 * pitch_mm
-    to_break_mm = cKDTree(raw_mm).query(points, distance_upper_bound=touch_mm)[0]
-    bare = np.ones(len(points), bool)
-    if len(sound_mm):
-        bare = cKDTree(sound_mm).query(points)[0] > np.minimum(to_break_mm, support_mm)
-    points, normals = points[bare], normals[bare]
-    piece = pieces(points, 2.0 * pitch_mm)
-    touching = np.isfinite(to_break_mm[bare])
-    kept = np.isin(piece, np.unique(piece[touching]))
-    if not kept.any():
+    points, normals = bare_skin(*samples, raw_mm, sound_mm, support_mm, touch_mm, 2.0 * pitch_mm)
+    if not len(points):
         raise CannotRepair("no skin is missing above the broken surface")
-    return points[kept], normals[kept]
+    return points, normals
+
+
+def bare_skin(
+    points_mm: Floats,
+    normals: Floats,
+    from_mm: Floats,
+    sound_mm: Floats,
+    support_mm: float,
+    touch_mm: float,
+    link_mm: float,
+) -> tuple[Floats, Floats]:
+    """Those of the samples (n, 3) of skin that are bare, and their normals, in pieces that come as near as
+    `touch_mm` to one of the places `from_mm`.
+
+    Bare is what has no sound point within `support_mm`, or lies nearer to those places.
+    """
+    to_place_mm = cKDTree(from_mm).query(points_mm, distance_upper_bound=touch_mm)[0]
+    bare = np.ones(len(points_mm), bool)
+    if len(sound_mm):
+        bare = cKDTree(sound_mm).query(points_mm)[0] > np.minimum(to_place_mm, support_mm)
+    piece = pieces(points_mm[bare], link_mm)
+    kept = np.isin(piece, np.unique(piece[np.isfinite(to_place_mm[bare])]))
+    return points_mm[bare][kept], normals[bare][kept]
 
 
 def _rim(skin: Skin, raw_mm: Floats, sound_mm: Floats, width_mm: float, cell_mm: float) -> Rim:

@@ -4,22 +4,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
+from geometry.damage.broken import bare_skin
 from geometry.damage.facing import outward_sign
-from geometry.damage.local_shape import local_quadrics, pieces, spacings_mm, thinned
+from geometry.damage.local_shape import gathered, local_quadrics, spacings_mm, thinned, turn_over
 from geometry.damage.regions import SKIN_SPACINGS, Field, Region
 from geometry.damage.skin import Skin, skin_of
 from geometry.deformation.twin import Twin
 from geometry.errors import CannotRepair
-from geometry.kernels.implicit import blend_quadrics, nearest_points
-from geometry.kernels.implicit_solid import column_crossings, nodes_inside
+from geometry.kernels.implicit import WIDENING, blend_quadrics, nearest_points
 from geometry.kernels.winding import winding_numbers
 from geometry.types import Floats, Measurand, Measured, NotMeasured
 
 NODES = 250_000  # of the grid over the metal, at most
 REACH = 3.0  # spacings about a point in which its quadric speaks
-WIDENING = 0.7  # of the blend of quadrics, per distance from the nearest point
 CELL_SIGMAS = 6.0  # points this near to each other, in their noise, count as one
 BORDER = 0.25  # standard uncertainty of where a bead ends, in spacings of its points
 OPEN = 0.1  # from 0 or 1: a winding number so far off both is of a place that nothing closes off
@@ -71,9 +69,7 @@ def _surface(region: Region, found: Field, skin: Skin) -> _Surface:
     points_mm = thinned(found.scan_mm[region.points], CELL_SIGMAS * found.noise_mm)
     _, feet_mm, face = skin.closest(points_mm)
     points_mm, frames, bending = local_quadrics(points_mm, points_mm)
-    inward = outward_sign(points_mm, frames[:, 2], feet_mm, skin.normals[face]) > 0.0
-    frames[inward, 1:] *= -1.0
-    bending[np.ix_(inward, np.array([0, 2]))] *= -1.0
+    turn_over(frames, bending, outward_sign(points_mm, frames[:, 2], feet_mm, skin.normals[face]) > 0.0)
     skin_mm, skin_areas_mm2 = _covered(region, found, feet_mm, skin)
     return _Surface(
         points_mm=points_mm,
@@ -93,20 +89,11 @@ def _covered(region: Region, found: Field, feet_mm: Floats, skin: Skin) -> tuple
     own_mm = np.concatenate([found.scan_mm[region.points], feet_mm])
     low_mm, high_mm = own_mm.min(axis=0) - reach_mm, own_mm.max(axis=0) + reach_mm
     skin_mm, normals = skin.samples(pitch_mm, low_mm, high_mm)
-    other = np.ones(len(found.scan_mm), bool)
+    other = ((found.scan_mm >= low_mm - reach_mm) & (found.scan_mm <= high_mm + reach_mm)).all(axis=1)
     other[region.points] = False
-    other &= ((found.scan_mm >= low_mm - reach_mm) & (found.scan_mm <= high_mm + reach_mm)).all(axis=1)
-    to_foot_mm = cKDTree(feet_mm).query(skin_mm)[0]
-    to_other_mm = np.full(len(skin_mm), np.inf)
-    if other.any():
-        to_other_mm = cKDTree(found.scan_mm[other]).query(skin_mm)[0]
-    bare = to_other_mm > np.minimum(to_foot_mm, reach_mm)
-    skin_mm, normals, to_foot_mm = skin_mm[bare], normals[bare], to_foot_mm[bare]
-    if not len(skin_mm):
-        return skin_mm, normals
-    piece = pieces(skin_mm, 2.0 * pitch_mm)
-    under = np.isin(piece, np.unique(piece[to_foot_mm <= reach_mm]))
-    return skin_mm[under], pitch_mm**2 * normals[under]
+    beside_mm = found.scan_mm[other]
+    skin_mm, normals = bare_skin(skin_mm, normals, feet_mm, beside_mm, reach_mm, reach_mm, 2.0 * pitch_mm)
+    return skin_mm, pitch_mm**2 * normals
 
 
 def _between(surface: _Surface, spacing_mm: float, skin: Skin) -> tuple[float, float]:
@@ -140,8 +127,7 @@ def _between(surface: _Surface, spacing_mm: float, skin: Skin) -> tuple[float, f
 
 def _outside(skin: Skin, low_mm: Floats, step_mm: float, shape: tuple[int, int, int]) -> Floats:
     """The share of each node of a grid that lies outside the skin."""
-    start, height_mm = column_crossings(skin.triangles_mm, low_mm[:2], step_mm, shape[:2])
-    inside = nodes_inside(start, height_mm, float(low_mm[2]), step_mm, shape)
+    inside = skin.nodes_inside(low_mm, step_mm, shape)
     outside = np.where(inside, 0.0, 1.0)
     crossed = ndimage.binary_dilation(inside) & ndimage.binary_dilation(~inside)
     distance_mm = skin.closest(low_mm + step_mm * np.argwhere(crossed))[0]
@@ -150,16 +136,10 @@ def _outside(skin: Skin, low_mm: Floats, step_mm: float, shape: tuple[int, int, 
 
 
 def _wound(surface: _Surface, places_mm: Floats, cell_mm: float) -> Floats:
-    """How far the surface and the covered skin wind round places (n, 3) no nearer to it than `cell_mm`."""
+    """How far the surface and the covered skin wind round places (n, 3) no nearer to it than `cell_mm`: from
+    there the parts of a cell are as good as one."""
     areas_mm2 = surface.frames[:, 2] * surface.spacing_mm[:, None] ** 2
-    above_mm, above_mm2 = _gathered(surface.points_mm, areas_mm2, cell_mm)
+    above_mm = thinned(surface.points_mm, cell_mm)
+    above_mm2 = gathered(surface.points_mm, areas_mm2, cell_mm)
     points_mm = np.concatenate([above_mm, surface.skin_mm])
     return winding_numbers(places_mm, points_mm, np.concatenate([above_mm2, -surface.skin_areas_mm2]))
-
-
-def _gathered(points_mm: Floats, areas_mm2: Floats, cell_mm: float) -> tuple[Floats, Floats]:
-    """The parts of a surface, those of each cell as one: for places no nearer than that they are as good."""
-    cell = np.floor((points_mm - points_mm.min(axis=0)) / cell_mm).astype(np.int64)
-    _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    sums = [np.bincount(group.ravel(), part) for part in np.hstack([points_mm, areas_mm2]).T]
-    return np.column_stack(sums[:3]) / count[:, None], np.column_stack(sums[3:])

@@ -5,7 +5,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from geometry.types import Floats, Ints
+from geometry.types import Bools, Floats, Ints
 
 FIT_POINTS = 24  # points of one local quadric
 
@@ -26,10 +26,16 @@ def spacings_mm(points_mm: Floats) -> Floats:
 
 def thinned(points_mm: Floats, cell_mm: float) -> Floats:
     """The mean of the points in each occupied cell: repeated points gain no weight."""
+    return gathered(points_mm, points_mm, cell_mm) / gathered(
+        points_mm, np.ones((len(points_mm), 1)), cell_mm
+    )
+
+
+def gathered(points_mm: Floats, values: Floats, cell_mm: float) -> Floats:
+    """The sums (cells, k) of the points' values (n, k) over each occupied cell."""
     cell = np.floor((points_mm - points_mm.min(axis=0)) / cell_mm).astype(np.int64)
-    _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    sums = [np.bincount(group.ravel(), points_mm[:, i]) for i in range(3)]
-    return np.column_stack(sums) / count[:, None]
+    group = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    return np.column_stack([np.bincount(group, column) for column in values.T])
 
 
 def local_quadrics(at_mm: Floats, points_mm: Floats) -> tuple[Floats, Floats, Floats]:
@@ -53,6 +59,12 @@ def local_quadrics(at_mm: Floats, points_mm: Floats) -> tuple[Floats, Floats, Fl
         feet_mm = at_mm + fit[:, :1] * frames[:, 2]
         frames = _tilted(frames, fit[:, 1:3])
     return feet_mm, frames, fit[:, 3:]
+
+
+def turn_over(frames: Floats, bending: Floats, which: Bools) -> None:
+    """Turn the normals of these quadrics round, their frames (n, 3, 3) still right-handed."""
+    frames[which, 1:] *= -1.0
+    bending[np.ix_(which, np.array([0, 2]))] *= -1.0
 
 
 def quadric_terms(u: Floats, v: Floats) -> Floats:

@@ -4,9 +4,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from geometry.kernels.implicit_solid import closest_on_triangles, triangle_cells
+from geometry.kernels.implicit_solid import (
+    closest_on_triangles,
+    column_crossings,
+    nodes_inside,
+    triangle_cells,
+)
 from geometry.kernels.parts import over_parts
-from geometry.types import Floats, Ints, Mesh
+from geometry.types import Bools, Floats, Ints, Mesh
 
 MAX_CELLS = 2_000_000
 
@@ -48,6 +53,11 @@ class Skin:
             np.clip((points_mm - self.low_mm) / self._cell_mm, 0, np.array(self._cells) - 1).astype(int).T
         )
         return np.asarray(np.argsort((x * self._cells[1] + y) * self._cells[2] + z, kind="stable"))
+
+    def nodes_inside(self, low_mm: Floats, step_mm: float, shape: tuple[int, int, int]) -> Bools:
+        """Which nodes of a grid of `shape`, from `low_mm` (3,) on, lie inside."""
+        start, height_mm = column_crossings(self.triangles_mm, low_mm[:2], step_mm, shape[:2])
+        return np.asarray(nodes_inside(start, height_mm, float(low_mm[2]), step_mm, shape))
 
     def samples(self, pitch_mm: float, low_mm: Floats, high_mm: Floats) -> tuple[Floats, Floats]:
         """Points (n, 3) spread evenly over the faces in a box, pitch squared each, and their normals."""

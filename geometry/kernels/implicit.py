@@ -5,6 +5,8 @@ from numba import njit
 
 from geometry.types import Floats
 
+WIDENING = 0.7  # of a blend of quadrics, per distance from the nearest point
+
 
 @njit(cache=True, nogil=True)
 def nearest_points(

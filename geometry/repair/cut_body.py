@@ -10,13 +10,11 @@ from skimage.measure import marching_cubes
 from geometry.damage.broken import BrokenSurface
 from geometry.damage.skin import Skin
 from geometry.errors import CannotRepair
-from geometry.kernels.implicit import blend_quadrics, nearest_points
-from geometry.kernels.implicit_solid import column_crossings, nodes_inside
+from geometry.kernels.implicit import WIDENING, blend_quadrics, nearest_points
 from geometry.types import Bools, Floats, Mesh
 
 FAR = 1e3  # field value of a node whose side is known but whose distance is not
 CONTRADICTING = 0.02  # share of the votes on a side that may be wrong before the surface counts as open
-WIDENING = 0.7  # of the blend of quadrics, per distance from the nearest point
 COVER = 2.0  # spacings about a point of sound skin in which no metal is lost
 COLLAR = 3  # nodes that the cut body reaches past the skin
 
@@ -86,16 +84,11 @@ def _lost_field(
         beyond_mm,
         WIDENING,
     )
-    inside = _inside(grid, skin)
+    inside = skin.nodes_inside(grid.origin_mm, grid.step_mm, grid.shape)
     _end_at_rim(field, to_break_mm, inside & band, grid, broken, slack_mm)
     lost = _lost_beyond_band(inside & ~band, inside & band, field) | (inside & band & (field > 0.0))
     beyond = ndimage.binary_dilation(lost, np.ones((3, 3, 3), bool), COLLAR)
     return np.where(band, field, np.where(lost | (beyond & ~inside), FAR, -FAR)), lost
-
-
-def _inside(grid: _Grid, skin: Skin) -> Bools:
-    start, height_mm = column_crossings(skin.triangles_mm, grid.origin_mm[:2], grid.step_mm, grid.shape[:2])
-    return np.asarray(nodes_inside(start, height_mm, float(grid.origin_mm[2]), grid.step_mm, grid.shape))
 
 
 def _end_at_rim(

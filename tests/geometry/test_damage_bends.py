@@ -52,11 +52,17 @@ def corner(points_mm: Floats) -> Floats:
     return np.clip(1.0 - away_mm / 9.0, 0.0, None) ** 2
 
 
+def bent_by(shape, bend_mm: float) -> tuple[Damage, Floats]:
+    """The one damage of a blade bent in a shape, and how much of the bend each point has."""
+    sheet = shape(scanned().cloud.points_mm)
+    (bend,) = told(scanned(), np.outer(bend_mm * sheet, [0.0, 1.0, 0.0]))
+    return bend, sheet
+
+
 @pytest.mark.parametrize("bend_mm", [-6.0, -1.0, 0.3, 3.0])
 @pytest.mark.parametrize(("shape", "zone"), [(curled, Zone.LEADING_EDGE), (corner, Zone.TIP)])
 def test_both_sides_of_bent_metal_are_one_deformation(shape, zone: Zone, bend_mm: float) -> None:
-    sheet = shape(scanned().cloud.points_mm)
-    (bend,) = told(scanned(), np.outer(bend_mm * sheet, [0.0, 1.0, 0.0]))
+    bend, sheet = bent_by(shape, bend_mm)
     assert (bend.kind, bend.zone) == (DamageKind.DEFORMATION, zone)
     assert isinstance(bend.depth_mm, Measurand)
     assert 0.65 * abs(bend_mm) < bend.depth_mm.value < abs(bend_mm) + 2.0 * bend.depth_mm.sigma
@@ -67,8 +73,7 @@ def test_both_sides_of_bent_metal_are_one_deformation(shape, zone: Zone, bend_mm
 @pytest.mark.parametrize(("shape", "zone"), [(curled, Zone.LEADING_EDGE), (corner, Zone.TIP)])
 def test_metal_bent_a_little_is_no_loss(shape, zone: Zone, bend_mm: float) -> None:
     """One side stands off enough to be found, the other a little less."""
-    sheet = shape(scanned().cloud.points_mm)
-    (bend,) = told(scanned(), np.outer(bend_mm * sheet, [0.0, 1.0, 0.0]))
+    bend, _ = bent_by(shape, bend_mm)
     assert (bend.kind, bend.zone) == (DamageKind.DEFORMATION, zone)
     assert isinstance(bend.off_nominal_mm, Measurand)
     assert bend.off_nominal_mm.value == pytest.approx(abs(bend_mm), abs=2.0 * bend.off_nominal_mm.sigma)
