@@ -13,7 +13,7 @@ from geometry.errors import CannotMeasure
 from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.chart import Chart, SectionSettings, unroll
 from geometry.sections.curve import Estimate, centroid, node_shares
-from geometry.sections.form import PROFILE_EXTREMES, SIDES, flattened_mm, share_beyond_sigma
+from geometry.sections.form import PROFILE_EXTREMES, SIDES, extreme_sigmas, flattened_mm, share_beyond_sigma
 from geometry.sections.measurands import SECTION_MEASURANDS, Definition, define, form, place, shape
 from geometry.sections.profile import (
     Gap,
@@ -147,7 +147,7 @@ def _section(profile: Profile, definition: Definition, alignment: Alignment) -> 
         **form(profile.curve_mm, profile.deviation_mm, seen, definition),
     }
     uncertainty = _uncertainty(profile, estimates, alignment)
-    measurands = _measured(definition, lost, estimates, _sigmas(profile, definition, uncertainty))
+    measurands = _measured(definition, lost, estimates, _sigmas(profile, seen, definition, uncertainty))
     order, run = _runs(seen)
     status, reason = _status(profile.gaps, definition, measurands)
     return Section(
@@ -177,6 +177,7 @@ class _Uncertainty:
     own: Floats  # (n, n)
     pose: Floats  # (n, 6)
     pose_covariance: Floats  # (6, 6)
+    node_sigma_mm: Floats  # (NODES,) of each node's displacement, the pose's share in it
 
     @property
     def covariance(self) -> Floats:
@@ -190,21 +191,29 @@ class _Uncertainty:
 
 def _uncertainty(profile: Profile, estimates: Mapping[str, Estimate], alignment: Alignment) -> _Uncertainty:
     gradients = np.stack([estimate.gradient for estimate in estimates.values()])
+    growth = profile.chart.pose_growth(profile.curve_mm, alignment.pivot_mm)
+    twist = pose_covariance(alignment)
     return _Uncertainty(
         estimates=estimates,
         own=profile.covariance(gradients),
-        pose=profile.pose_gradient(gradients, alignment.pivot_mm),
-        pose_covariance=pose_covariance(alignment),
+        pose=gradients @ growth,
+        pose_covariance=twist,
+        node_sigma_mm=np.sqrt(profile.node_sigmas() ** 2 + ((growth @ twist) * growth).sum(axis=1)),
     )
 
 
-def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty) -> Mapping[str, float]:
+def _sigmas(
+    profile: Profile, seen: Bools, definition: Definition, uncertainty: _Uncertainty
+) -> Mapping[str, float]:
     """Standard uncertainty of each estimate; apart for those that are no smooth function of the nodes.
 
-    An extreme of the profile rests on its one node, and bears what smoothing may have taken off it.
+    An extreme of the profile bears what smoothing may have taken off it.
     """
     covariance, estimates = uncertainty.covariance, uncertainty.estimates
-    sigmas = dict(zip(estimates, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    sigmas = {
+        **dict(zip(estimates, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        **extreme_sigmas(profile.deviation_mm, seen, definition.side, uncertainty.node_sigma_mm),
+    }
     supports, trusted = definition.supports(), ~profile.open_nodes(margin_mm=_RIM_MM)
     for name in (name for name in estimates if name.endswith(PROFILE_EXTREMES)):
         flat_mm = _flattened_mm(name, estimates[name], profile, supports[name] & trusted)
@@ -217,7 +226,7 @@ def _sigmas(profile: Profile, definition: Definition, uncertainty: _Uncertainty)
         along, rms_mm = sigmas["waviness_rms_mm"], estimates["waviness_rms_mm"].value
         sigmas["waviness_rms_mm"] = waves.rms_sigma(rms_mm, along, amplitudes)
         sigmas["out_of_tolerance_fraction"] = share_beyond_sigma(
-            profile.deviation_mm, profile.node_sigmas(), share, definition.settings.tolerance_mm
+            profile.deviation_mm, uncertainty.node_sigma_mm, share, definition.settings.tolerance_mm
         )
     return sigmas
 

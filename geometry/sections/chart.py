@@ -138,6 +138,14 @@ class Chart:
         growth: Floats = (self.nodes_mm[high] - self.nodes_mm[low]) / (self.z_mm[high] - self.z_mm[low])
         return growth
 
+    def pose_growth(self, curve_mm: Floats, pivot_mm: Floats) -> Floats:
+        """(NODES, 6): growth of the outward displacement of a measured curve's nodes, in the section's plane,
+        with a pose twist of the part about `pivot_mm`."""
+        place_mm = np.column_stack([curve_mm, np.full(NODES, self.section_z_mm)]) - pivot_mm
+        normals = outward_normals(curve_mm)
+        push = np.column_stack([normals, -(normals * self.growth()).sum(axis=1)])
+        return np.hstack([np.cross(place_mm, push), push])
+
     def lay(
         self,
         points_mm: Floats,

@@ -13,23 +13,48 @@ from geometry.types import Bools, Floats, Ints
 
 SIDES = ("le", "ss", "te", "ps")  # as `NominalSection.side` numbers them: edges, suction, pressure side
 SURE = 5.0  # standard errors of what noise cannot explain
+FARTHER = 2.0  # sigmas by which a node that is not the farthest may yet be
 PROFILE_EXTREMES = ("profile_max_mm", "profile_min_mm", "profile_form_max_mm", "profile_form_min_mm")
 
 
 def extremes(deviation_mm: Floats, seen: Bools, side: Ints) -> dict[str, Estimate]:
     """Largest and smallest signed distance to the nominal over the seen nodes: of all, and of each side."""
-    parts = {"": seen, **{f"{name}_": seen & (side == index) for index, name in enumerate(SIDES)}}
     found = {}
-    for name, part in parts.items():
-        if part.any():
-            found[f"{name}profile_max_mm"] = _at(deviation_mm, highest(deviation_mm, part))
-            found[f"{name}profile_min_mm"] = _at(deviation_mm, highest(-deviation_mm, part))
+    for name, part in _parts(seen, side):
+        found[f"{name}profile_max_mm"] = _at(deviation_mm, highest(deviation_mm, part))
+        found[f"{name}profile_min_mm"] = _at(deviation_mm, highest(-deviation_mm, part))
     return found
+
+
+def extreme_sigmas(deviation_mm: Floats, seen: Bools, side: Ints, sigma_mm: Floats) -> dict[str, float]:
+    """The sigmas of these `extremes`, of nodes that are each known to `sigma_mm` (m,)."""
+    found = {}
+    for name, part in _parts(seen, side):
+        found[f"{name}profile_max_mm"] = highest_sigma(deviation_mm, part, sigma_mm)
+        found[f"{name}profile_min_mm"] = highest_sigma(-deviation_mm, part, sigma_mm)
+    return found
+
+
+def _parts(seen: Bools, side: Ints) -> list[tuple[str, Bools]]:
+    """The seen nodes, of all and of each side, by what the names of their extremes begin with."""
+    sides = [(f"{name}_", seen & (side == index)) for index, name in enumerate(SIDES)]
+    return [(name, part) for name, part in [("", seen), *sides] if part.any()]
 
 
 def highest(deviation_mm: Floats, part: Bools) -> int:
     """The node of a part with the largest deviation."""
     return int(np.argmax(np.where(part, deviation_mm, -np.inf)))
+
+
+def highest_sigma(deviation_mm: Floats, part: Bools, sigma_mm: Floats) -> float:
+    """Sigma of the largest deviation over a part, of nodes that are each known to `sigma_mm` (m,).
+
+    In truth another node may lie farthest than that of the largest measured, which is known better, or is
+    where a turn of the pose moves nothing. Half of how much farther the extreme were, lay every node out by
+    two of its sigmas.
+    """
+    farther = np.max((deviation_mm + FARTHER * sigma_mm)[part]) - np.max(deviation_mm[part])
+    return float(farther / FARTHER)
 
 
 def _at(deviation_mm: Floats, node: int) -> Estimate:

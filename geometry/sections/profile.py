@@ -19,7 +19,6 @@ from geometry.sections.chart import (
     SectionSettings,
     broad_normals,
     curvature,
-    outward_normals,
     unroll,
 )
 from geometry.sections.motion import Motion, find_motion, rigid_columns
@@ -85,14 +84,6 @@ class Profile:
         across = self.knots.across(self.z_mm)
         variances = self.fit.variances(first, cubic_weights(u, first), across, self.columns.T)
         return np.sqrt(np.maximum(variances, 0.0))
-
-    def pose_gradient(self, gradients: Floats, pivot_mm: Floats) -> Floats:
-        """(n, 6): growth of the same functions with a pose twist of the part about `pivot_mm`."""
-        place = np.column_stack([self.curve_mm, np.full(NODES, self.z_mm)]) - pivot_mm
-        normals = outward_normals(self.curve_mm)
-        slope = -(normals * self.chart.growth()).sum(axis=1)
-        push = np.column_stack([normals, slope])
-        return gradients @ np.hstack([np.cross(place, push), push])
 
     @property
     def z_mm(self) -> float:

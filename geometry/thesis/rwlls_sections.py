@@ -15,7 +15,7 @@ from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.airfoil import Section, SectionStatus
 from geometry.sections.chart import NODES, Chart, SectionSettings, outward_normals, unroll
 from geometry.sections.curve import Estimate, node_shares
-from geometry.sections.form import share_beyond_sigma
+from geometry.sections.form import extreme_sigmas, share_beyond_sigma
 from geometry.sections.measurands import Definition, define, form, place, shape
 from geometry.sections.motion import find_motion
 from geometry.sections.profile import Gap, Scan, explain_gaps, find_gaps, scan_of
@@ -208,8 +208,9 @@ def _sigmas(
     """Standard uncertainty of each estimate: noise, disagreement of the local curves, and the pose."""
     gradients = np.stack([estimate.gradient for estimate in estimates.values()])
     noise = _Noise(profile=profile, t=traced.t, normals=outward_normals(traced.curve_mm))
-    pose = gradients @ _pose_gradient(traced, chart, noise.normals, alignment)
-    covariance = noise.covariance(gradients) + pose @ pose_covariance(alignment) @ pose.T
+    growth, twist = chart.pose_growth(traced.curve_mm, alignment.pivot_mm), pose_covariance(alignment)
+    covariance = noise.covariance(gradients) + gradients @ growth @ twist @ growth.T @ gradients.T
+    node_sigma_mm = np.sqrt(noise.node_sigmas() ** 2 + ((growth @ twist) * growth).sum(axis=1))
     names, waves = list(estimates), definition.waves
     sigmas = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     xy = [names.index("position_x_mm"), names.index("position_y_mm")]
@@ -218,10 +219,11 @@ def _sigmas(
     share, tolerance_mm = node_shares(definition.curve_mm), definition.settings.tolerance_mm
     return {
         **sigmas,
+        **extreme_sigmas(traced.deviation_mm, np.ones(NODES, bool), definition.side, node_sigma_mm),
         "position_mm": _distance_sigma(shift, covariance[np.ix_(xy, xy)]),
         "waviness_rms_mm": waves.rms_sigma(rms_mm, along, noise.covariance(waves.harmonics * waves.share_mm)),
         "out_of_tolerance_fraction": share_beyond_sigma(
-            traced.deviation_mm, noise.node_sigmas(), share, tolerance_mm
+            traced.deviation_mm, node_sigma_mm, share, tolerance_mm
         ),
     }
 
@@ -231,13 +233,6 @@ def _distance_sigma(shift_mm: Floats, covariance: Floats) -> float:
     worst = float(np.linalg.eigvalsh(covariance)[-1])
     along = float(shift_mm @ covariance @ shift_mm)
     return float(np.sqrt((along + worst**2) / (float(shift_mm @ shift_mm) + worst)))
-
-
-def _pose_gradient(traced: Traced, chart: Chart, normals: Floats, alignment: Alignment) -> Floats:
-    """(NODES, 6): growth of the nodes' displacement along their normals with a twist of the pose."""
-    place_mm = np.column_stack([traced.curve_mm, np.full(NODES, chart.section_z_mm)]) - alignment.pivot_mm
-    push = np.column_stack([normals, -(normals * chart.growth()).sum(axis=1)])
-    return np.hstack([np.cross(place_mm, push), push])
 
 
 def _lost(z_mm: float, definition: Definition, covered: float, why: NotMeasured) -> Section:

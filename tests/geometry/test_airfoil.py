@@ -132,15 +132,19 @@ def test_the_pose_is_part_of_the_sigmas():
     pose = alignment(information=np.diag(sd**-2.0))
     rng = np.random.default_rng(3)
     names = ["position_x_mm", "position_y_mm", "orientation_deg"]
+    extremes = ["profile_max_mm", "profile_min_mm"]
     alone, both = measure(points).measurands, measure(points, pose=pose).measurands
     values = []
     for _ in range(30):
         T = exp(rng.normal(0.0, 1.0, 6) * sd, pose.pivot_mm)
         moved = measure(points, pose=alignment(T=T)).measurands
-        values.append([moved[name].value for name in names])
-    for name, spread in zip(names, np.std(values, axis=0), strict=True):
+        values.append([moved[name].value for name in names + extremes])
+    for name, spread in zip(names, np.std(values, axis=0), strict=False):
         added = np.sqrt(both[name].sigma ** 2 - alone[name].sigma ** 2)
         assert added == pytest.approx(spread, rel=0.35, abs=2e-4), name
+    for name, found in zip(extremes, np.transpose(values)[-2:], strict=True):
+        off = np.sqrt(np.mean((found - both[name].value) ** 2))
+        assert 0.6 < off / both[name].sigma < 1.25, name
 
 
 def test_a_free_direction_of_the_pose_is_finite_and_large():

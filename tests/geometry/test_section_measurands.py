@@ -10,7 +10,7 @@ from geometry.sections.chart import NODES, FitSettings, SectionSettings, outward
 from geometry.sections.chords import chord, hollow, nose_tail_chord, tangent_chord
 from geometry.sections.curve import camber_line, centroid, edge, node_arc, node_shares, thick_part, thickness
 from geometry.sections.edge_shape import flat, min_radius
-from geometry.sections.form import share_beyond, share_beyond_sigma, wave_band
+from geometry.sections.form import highest_sigma, share_beyond, share_beyond_sigma, wave_band
 from geometry.sections.measurands import SECTION_MEASURANDS, define, section_measurands, shape
 from geometry.sections.section_fit import best_fit
 from tests.geometry.airfoils import AnalyticNominal, Blade, DiscAirfoil
@@ -228,6 +228,25 @@ def test_the_share_out_of_tolerance_is_that_of_the_arc():
     assert share_beyond(slope, share, 0.1) == pytest.approx(0.5, abs=1e-3)
     sigma = share_beyond_sigma(slope, np.full(NODES, 0.01), share, 0.1)
     assert sigma == pytest.approx(0.05, abs=2e-3)
+
+
+@pytest.mark.parametrize("rest", [0.05, 0.04, 0.02])
+def test_the_sigma_of_an_extreme_knows_of_the_nodes_that_a_turn_lifts_past_it(rest):
+    """The highest node lies where a turn moves nothing; the ends, `rest` high, go up and down with it."""
+    arm = np.linspace(-1.0, 1.0, NODES)
+    deviation = np.maximum(0.05 - np.abs(arm), rest)
+    growth, everywhere = 0.02 * arm, np.ones(NODES, bool)
+    turns = np.random.default_rng(0).normal(size=2000)
+    farthest = (deviation + growth * turns[:, None]).max(axis=1)
+    off = np.sqrt(np.mean((farthest - deviation.max()) ** 2))
+    assert 0.95 * off - 2e-3 <= highest_sigma(deviation, everywhere, np.abs(growth)) <= 1.5 * off
+
+
+def test_the_sigma_of_an_extreme_is_that_of_its_node_where_no_other_comes_near():
+    deviation, sigma = np.zeros(NODES), np.full(NODES, 0.004)
+    deviation[3], sigma[3] = 0.1, 0.002
+    assert highest_sigma(deviation, np.ones(NODES, bool), sigma) == pytest.approx(0.002)
+    assert highest_sigma(deviation, np.arange(NODES) > 3, sigma) == pytest.approx(0.004)
 
 
 def test_largest_thickness_and_its_place_come_from_the_same_part():
