@@ -86,7 +86,7 @@ def _lost_field(
     )
     inside = skin.nodes_inside(grid.origin_mm, grid.step_mm, grid.shape)
     _end_at_rim(field, to_break_mm, inside & band, grid, broken, slack_mm)
-    lost = _lost_beyond_band(inside & ~band, inside & band, field) | (inside & band & (field > 0.0))
+    lost = lost_beyond_band(inside & ~band, inside & band, field) | (inside & band & (field > 0.0))
     beyond = ndimage.binary_dilation(lost, np.ones((3, 3, 3), bool), COLLAR)
     return np.where(band, field, np.where(lost | (beyond & ~inside), FAR, -FAR)), lost
 
@@ -111,11 +111,12 @@ def _end_at_rim(
     field[at] = np.minimum(field[at], covered_mm)
 
 
-def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools:
+def lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools:
     """The free nodes in the twin, out of reach of the broken surface, that lie on its outer side.
 
-    Each connected region takes the side of the band nodes at its border. Raises `CannotRepair` if they
-    contradict each other: then there is a hole in the band.
+    Each connected region takes the side of the band nodes at its border, each of which has as much to say as
+    it lies off the broken surface. Raises `CannotRepair` if they contradict each other: then there is a hole
+    in the band.
     """
     region, count = ndimage.label(free)
     votes = np.zeros((count + 1, 2))
@@ -124,7 +125,8 @@ def _lost_beyond_band(free: Bools, band: Bools, field: Floats) -> Bools:
             here = tuple(a if i == axis else slice(None) for i in range(3))
             there = tuple(b if i == axis else slice(None) for i in range(3))
             meet = (region[here] > 0) & band[there]
-            np.add.at(votes, (region[here][meet], (field[there][meet] > 0.0).astype(int)), 1.0)
+            side_mm = field[there][meet]
+            np.add.at(votes, (region[here][meet], (side_mm > 0.0).astype(int)), np.abs(side_mm))
     lost = votes[:, 1] > votes[:, 0]
     contradicting = votes[1:].min(axis=1).sum()
     if not contradicting <= CONTRADICTING * votes.sum():

@@ -2,12 +2,15 @@
 
 import manifold3d
 import numpy as np
+import pytest
 
 from geometry.damage.local_shape import frames_along
 from geometry.damage.skin import Skin
+from geometry.errors import CannotRepair
 from geometry.kernels.implicit import blend_quadrics, nearest_points
 from geometry.kernels.implicit_solid import column_crossings, nodes_inside
-from geometry.types import Floats, Mesh
+from geometry.repair.cut_body import lost_beyond_band
+from geometry.types import Bools, Floats, Mesh
 from tests.geometry import repair_blades as blades
 
 
@@ -123,3 +126,23 @@ def test_nodes_inside_match_the_winding_number() -> None:
     assert 50 < inside.sum() < inside.size - 50
     for index in np.ndindex(shape):
         assert inside[index] == (solid_angles(origin + step * np.array(index), triangles) > 0.5)
+
+
+def metal_behind_a_break(wrong_mm: float) -> tuple[Bools, Bools, Floats]:
+    """20 x 20 x 20 nodes whose lowest layer is the band of a break, one node in eighteen of it `wrong_mm`."""
+    band = np.zeros((20, 20, 20), bool)
+    band[:, :, 0] = True
+    field = np.full(band.shape, np.inf)
+    field[:, :, 0] = -0.5
+    field[2:4, :11, 0] = wrong_mm
+    return ~band, band, field
+
+
+def test_nodes_that_hardly_stand_off_the_break_do_not_deny_the_side_of_the_metal_behind_it() -> None:
+    """Where a break turns sharply into the skin, some quadrics put a little of the metal outside."""
+    assert not lost_beyond_band(*metal_behind_a_break(0.05)).any()
+
+
+def test_nodes_as_far_outside_as_others_are_inside_show_a_hole_in_the_break() -> None:
+    with pytest.raises(CannotRepair, match="open"):
+        lost_beyond_band(*metal_behind_a_break(0.5))
