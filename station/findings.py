@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from station.plans import BladePlan
 
 JUDGED_ZONES = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
+NO_PAIR = NotMeasured(reason="fewer than two sections")
 UNITS = ("mm", "deg", "mm3")
-PROFILE = ("profile_mm", "profile_form_mm")  # the larger of its two ends is judged, min and max are reported
+PROFILE = ("profile_mm", "profile_form_mm")  # both of its ends are judged, the worse decides
 
 
 class Outcome(StrEnum):
@@ -115,9 +116,9 @@ def section_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Find
     for z_mm in plan.sections.z_mm:
         section = next((each for each in measurement.sections if same_z(each.z_mm, z_mm)), None)
         for key, limit in plan.limits.section.at(z_mm).items():
-            measured, nominal = characteristic(section, key)
-            excused = measured if damaged else doubted(measured)
-            yield section_finding(f"sections[{z_mm}].{key}", limit, excused, nominal, k)
+            each, nominal = characteristic(section, key)
+            excused = each if damaged else [doubted(measured) for measured in each]
+            yield worst_finding(f"sections[{z_mm}].{key}", limit, excused, nominal, k)
 
 
 def doubted(measured: Measured) -> Measured:
@@ -125,6 +126,16 @@ def doubted(measured: Measured) -> Measured:
     if isinstance(measured, NotMeasured) and measured.in_damage:
         return NotMeasured(reason=f"{measured.reason}, but no damage was found there")
     return measured
+
+
+def worst_finding(name: str, limit: Limit, each: Sequence[Measured], nominal: float, k: float) -> Finding:
+    """The finding of several values under one limit: each is judged, and the worst decides.
+
+    A value with a large uncertainty does not hide behind a larger one that is better known. What damage
+    excuses decides only where there is nothing else.
+    """
+    findings = [section_finding(name, limit, measured, nominal, k) for measured in each]
+    return min(findings, key=lambda found: (severity(found), -(found.judged or 0.0)))
 
 
 def section_finding(name: str, limit: Limit, measured: Measured, nominal: float, k: float) -> Finding:
@@ -137,25 +148,15 @@ def section_finding(name: str, limit: Limit, measured: Measured, nominal: float,
     return measured_finding(name, limit, measured.value, k * measured.sigma, nominal)
 
 
-def characteristic(section: Section | None, key: str) -> tuple[Measured, float]:
+def characteristic(section: Section | None, key: str) -> tuple[Sequence[Measured], float]:
     """What was measured for a limited key, and its nominal value (NaN: the nominal has none)."""
     if section is None:
-        return NotMeasured(reason="the section was not measured"), 0.0
+        return [NotMeasured(reason="the section was not measured")], 0.0
     absent = NotMeasured(reason=section.reason or "was not measured")
     if key.endswith(PROFILE):
-        ends = (
-            section.measurands.get(f"{key.removesuffix('_mm')}_{end}_mm", absent) for end in ("max", "min")
-        )
-        return largest(*ends), 0.0
-    return section.measurands.get(key, absent), section.nominals.get(key, float("nan"))
-
-
-def largest(*each: Measured) -> Measured:
-    """The value of largest magnitude; not measured if one of them is not."""
-    measured = [m for m in each if isinstance(m, Measurand)]
-    if len(measured) < len(each):
-        return next(m for m in each if isinstance(m, NotMeasured))
-    return max(measured, key=lambda m: abs(m.value))
+        ends = (f"{key.removesuffix('_mm')}_{end}_mm" for end in ("max", "min"))
+        return [section.measurands.get(end, absent) for end in ends], 0.0
+    return [section.measurands.get(key, absent)], section.nominals.get(key, float("nan"))
 
 
 def blade_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Finding]:
@@ -167,7 +168,7 @@ def blade_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Findin
             yield unmeasured_finding(name, limit, "the sections were not measured", Outcome.HOLD)
         elif key == "relative_twist_deg":
             twists = [twist.twist_deg.measured for twist in line.relative_twist]
-            yield section_finding(name, limit, largest(*twists), 0.0, k)
+            yield worst_finding(name, limit, twists or [NO_PAIR], 0.0, k)
         else:
             judged: Judged = getattr(line, key)
             nominal = float("nan") if judged.nominal is None else judged.nominal
@@ -176,12 +177,10 @@ def blade_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Findin
 
 def form_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Finding]:
     """The finding of the twin against the nominal, or of metal bent farther off it, if limited."""
-    limit, name = plan.limits.form.deviation_mm, "form.deviation_mm"
-    match limit, largest(measurement.form_mm, *(damage.off_nominal_mm for damage in bent(measurement))):
-        case Limit(), Measurand(value=value, sigma=sigma):
-            yield measured_finding(name, limit, value, plan.measurement.coverage_factor * sigma, 0.0)
-        case Limit(), NotMeasured(reason=reason):
-            yield unmeasured_finding(name, limit, reason, Outcome.HOLD)
+    limit, k = plan.limits.form.deviation_mm, plan.measurement.coverage_factor
+    if limit is not None:
+        each = [measurement.form_mm, *(damage.off_nominal_mm for damage in bent(measurement))]
+        yield worst_finding("form.deviation_mm", limit, [doubted(measured) for measured in each], 0.0, k)
 
 
 def judged_damages(measurement: Measurement) -> Iterator[tuple[int, Damage]]:
@@ -212,7 +211,7 @@ def damage_findings(measurement: Measurement, plan: BladePlan) -> Iterator[Findi
             yield count_finding(zone, limits.count, damages, measurement, plan)
 
 
-SEVERITY = (Outcome.SCRAP, Outcome.HOLD, Outcome.REPAIR, Outcome.PASS)
+SEVERITY = (Outcome.SCRAP, Outcome.HOLD, Outcome.REPAIR, Outcome.PASS, Outcome.NOT_JUDGED)
 
 
 def depth_finding(
@@ -227,7 +226,7 @@ def depth_finding(
         return unmeasured_finding(name, limit, "damage was not looked for", Outcome.HOLD)
     if not damages:
         return nothing_found(name, limit, measurement.detection_mm.get(zone))
-    each = [size_finding(name, limit, damage.depth_mm, k) for damage in damages]
+    each = [height_finding(name, limit, damage, k) for damage in damages]
     return min(each, key=lambda found: (severity(found), -(found.value or 0.0)))
 
 
@@ -237,6 +236,16 @@ def severity(finding: Finding) -> tuple[int, bool]:
     borderline = finding.outcome == Outcome.HOLD and finding.proven_repairable
     rank = SEVERITY.index(Outcome.REPAIR if borderline else finding.outcome)
     return rank, borderline
+
+
+def height_finding(name: str, limit: Limit, damage: Damage, k: float) -> Finding:
+    """The finding of the depth of one damage. What stands on the skin and closes off no volume may be no
+    metal, a fibre or a reflection: it scraps no part."""
+    finding = size_finding(name, limit, damage.depth_mm, k)
+    volume = damage.volume_mm3
+    if damage.kind.value == "excess" and isinstance(volume, NotMeasured) and finding.outcome == Outcome.SCRAP:
+        return unmeasured_finding(name, limit, f"its volume: {volume.reason}", Outcome.HOLD)
+    return finding
 
 
 def size_finding(name: str, limit: Limit, size: Measured, k: float) -> Finding:
@@ -266,6 +275,8 @@ def volume_finding(
     name = f"damage.{zone}.volume_mm3"
     if measurement.damages is None:
         return unmeasured_finding(name, limit, "damage was not looked for", Outcome.HOLD)
+    if not damages and not isinstance(measurement.detection_mm.get(zone), Measurand):
+        return nothing_found(name, limit, measurement.detection_mm.get(zone))
     measured = [damage.volume_mm3 for damage in damages if isinstance(damage.volume_mm3, Measurand)]
     U = plan.measurement.coverage_factor * sum(volume.sigma for volume in measured)
     finding = measured_finding(name, limit, sum((volume.value for volume in measured), 0.0), U, None)
@@ -286,8 +297,8 @@ def count_finding(
         least_mm = detection.value
     if measurement.damages is None:
         return unmeasured_finding(name, limit, "damage was not looked for", Outcome.HOLD)
-    if damages and least_mm is None:
-        return unmeasured_finding(name, limit, "no detection limit", Outcome.HOLD)
+    if not isinstance(detection, Measurand) and (not damages or least_mm is None):
+        return nothing_found(name, limit, detection)
     deeper = [d for d in damages if proven_deeper(d.depth_mm, least_mm or 0.0, plan)]
     return measured_finding(name, limit, float(len(deeper)), 0.0, None)
 

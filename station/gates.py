@@ -78,7 +78,7 @@ def alignment_doubts(measurement: Measurement, plan: BladePlan, acceptance: Acce
         return
     for text in pose_doubts(measurement.alignment, acceptance):
         yield Reason(cause=Cause.ALIGNMENT, text=f"alignment: {text}")
-    noise_mm, sigma_mm = noise_of(measurement, measurement.alignment), plan.measurement.sigma_mm
+    noise_mm, sigma_mm = noise_of(measurement, measurement.alignment, plan), plan.measurement.sigma_mm
     if not noise_mm <= acceptance.max_noise_ratio * sigma_mm:
         text = f"noise: the scan scatters by {noise_mm:.3g} mm, the plan states {sigma_mm:g} mm"
         yield Reason(cause=Cause.ALIGNMENT, text=text)
@@ -101,11 +101,13 @@ def pose_doubts(alignment: Alignment, acceptance: Acceptance) -> Iterator[str]:
         yield str(error)
 
 
-def noise_of(measurement: Measurement, alignment: Alignment) -> float:
+def noise_of(measurement: Measurement, alignment: Alignment, plan: BladePlan) -> float:
     """Scatter of the scan along the normal in mm. Residuals to the nominal hold the part's form as well;
-    those to its twin do not."""
+    those to its twin do not. An alignment on a part of the blade knows the scatter of that part only."""
     if measurement.residual_mm is None:
         return alignment.noise_mm
+    if plan.alignment.method != "airfoil":
+        return measurement.residual_mm
     return min(alignment.noise_mm, measurement.residual_mm)
 
 

@@ -79,6 +79,7 @@ def prepare_recipe(plan: BladePlan, axis: AxisCalibration | None = None) -> Reci
         check_span(plan, float(mesh.vertices_mm[:, 2].min()), float(mesh.vertices_mm[:, 2].max()))
         nominal = prepare_nominal(mesh, nominal_settings(plan))
         check_datum(plan, nominal)
+        check_sections(plan, nominal)
         outlines = tuple(outline(nominal, z_mm) for z_mm in plan.sections.z_mm)
     except BadInput as error:
         raise BadPlan(plan.path, str(error), "nominal") from error
@@ -116,6 +117,14 @@ def nominal_settings(plan: BladePlan) -> NominalSettings:
         tip_mm=plan.zones.tip_mm,
         edge_mm=plan.zones.edge_mm,
     )
+
+
+def check_sections(plan: BladePlan, nominal: Nominal) -> None:
+    """Raise `BadPlan` unless the sections lie on the airfoil."""
+    for z_mm in plan.sections.z_mm:
+        if not nominal.z_min_mm <= z_mm <= nominal.z_max_mm:
+            span = f"{nominal.z_min_mm:g} to {nominal.z_max_mm:g} mm"
+            raise BadPlan(plan.path, f"{z_mm:g} mm is outside the airfoil, {span}", "sections.z_mm")
 
 
 def check_datum(plan: BladePlan, nominal: Nominal) -> None:

@@ -71,7 +71,8 @@ def findings_at(z_mm: float, verdict: Verdict) -> dict[str, Finding]:
 
 
 def row(section: Section, name: str, finding: Finding | None) -> Row:
-    measured, nominal = characteristic(section, name)
+    each, nominal = characteristic(section, name)
+    measured = next((m for m in each if finding and getattr(m, "value", None) == finding.value), each[0])
     number = measured if isinstance(measured, Measurand) else None
     return Row(
         z_mm=section.z_mm,

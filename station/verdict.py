@@ -132,17 +132,24 @@ def doubts(measurement: Measurement, plan: BladePlan, findings: Sequence[Finding
             yield Reason(cause=cause, text=described(finding))
     yield from overlooked(measurement, plan)
     if plan.limits.form.deviation_mm is None:
-        yield from unjudged_bends(measurement, plan)
+        yield from unjudged_bends(measurement, plan, findings)
 
 
-def unjudged_bends(measurement: Measurement, plan: BladePlan) -> Iterator[Reason]:
-    """Bent metal that no limited section passes through, where the form has no limit."""
-    judged_mm = [z_mm for z_mm in plan.sections.z_mm if plan.limits.section.at(z_mm)]
+def unjudged_bends(
+    measurement: Measurement, plan: BladePlan, findings: Sequence[Finding]
+) -> Iterator[Reason]:
+    """Bent metal through which no section passes that has a number for a limit, where the form has none."""
+    numbers = {finding.characteristic for finding in findings if finding.judged is not None}
+    judged_mm = [
+        z_mm
+        for z_mm in plan.sections.z_mm
+        if any(f"sections[{z_mm}].{key}" in numbers for key in plan.limits.section.at(z_mm))
+    ]
     for damage in bent(measurement):
         low_mm, high_mm = damage.span_mm
         if not any(low_mm <= z_mm <= high_mm for z_mm in judged_mm):
             where = f"deformation at z {low_mm:.1f} to {high_mm:.1f} mm"
-            text = f"{where}: neither form nor a section there has a limit"
+            text = f"{where}: neither form nor a section there was judged"
             yield Reason(cause=Cause.NOT_MEASURED, text=text)
 
 
@@ -150,6 +157,11 @@ def unseen(measurement: Measurement, plan: BladePlan) -> Iterator[Reason]:
     """The zones of the required surface that were not seen."""
     if not measurement.zones:
         yield Reason(cause=Cause.UNSEEN, text="coverage: was not measured")
+    there = {zone.zone for zone in measurement.zones}
+    for name, limits in plan.limits.damage.items():
+        if measurement.zones and name not in there and limits:
+            text = f"{name.replace('_', ' ')}: has limits, but no surface of it is required to be seen"
+            yield Reason(cause=Cause.UNSEEN, text=text)
     for zone in measurement.zones:
         if not is_seen(zone, plan):
             text = (

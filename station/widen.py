@@ -85,6 +85,7 @@ def _damage(damage: Damage, merge_mm: float) -> Damage:
     return replace(
         damage,
         depth_mm=wider(damage.depth_mm, merge_mm),
+        off_nominal_mm=wider(damage.off_nominal_mm, merge_mm),
         remaining_chord_mm=wider(damage.remaining_chord_mm, 2.0 * merge_mm),
         volume_mm3=wider(damage.volume_mm3, _volume_mm3(damage.area_mm2, merge_mm)),
     )

@@ -86,15 +86,16 @@ def blade_line(sections: Sequence[Section], alignment: Alignment) -> BladeLine:
 
 
 def _lacking(sections: Sequence[Section]) -> NotMeasured | None:
-    """Why the sections have no line: the first of them that was not measured all round."""
+    """Why the sections have no line: one is not whole; for damage only if that holds for all that are not."""
+    why = None
     for section in sections:
         if section.stacking is None:
             lost = section.measurands.get("position_mm")
             damaged = isinstance(lost, NotMeasured) and lost.in_damage
-            return NotMeasured(
-                reason=f"the section at z = {section.z_mm:g} mm has no position", in_damage=damaged
-            )
-    return None
+            if why is None or not damaged:
+                reason = f"the section at z = {section.z_mm:g} mm has no position"
+                why = NotMeasured(reason=reason, in_damage=damaged)
+    return why
 
 
 def _stack(sections: Sequence[Section], alignment: Alignment) -> _Stack:

@@ -6,7 +6,7 @@ support has a gap there is no number.
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
 
@@ -289,9 +289,16 @@ def _degrees(angle: Estimate) -> Estimate:
 def shape(
     curve_mm: Floats, definition: Definition, wanted: Collection[str] | None = None
 ) -> dict[str, Estimate]:
-    """The estimates that need one curve only, by name: those `wanted`, or all."""
+    """The estimates that need one curve only, by name: those `wanted`, or all.
+
+    The stagger is told within half a turn of its nominal, also where that points backwards.
+    """
     drawn = Drawn(curve_mm=curve_mm, le=definition.le, te=definition.te)
-    return _estimates(drawn, definition.shapes, definition.shapes if wanted is None else wanted)
+    found = _estimates(drawn, definition.shapes, definition.shapes if wanted is None else wanted)
+    if "stagger_deg" in found and "stagger_deg" in definition.nominals:
+        turns = round((found["stagger_deg"].value - definition.nominals["stagger_deg"]) / 360.0)
+        found["stagger_deg"] = replace(found["stagger_deg"], value=found["stagger_deg"].value - 360.0 * turns)
+    return found
 
 
 def place(curve_mm: Floats, nominal_mm: Floats) -> dict[str, Estimate]:

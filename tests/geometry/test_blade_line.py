@@ -120,6 +120,17 @@ def test_a_section_without_position_leaves_no_line_and_says_which():
     assert isinstance(line.relative_twist[2].twist_deg.measured, Measurand)
 
 
+@pytest.mark.parametrize("unseen", [1, 2])
+def test_damage_excuses_no_line_that_an_unseen_section_lacks_as_well(unseen):
+    sections = stack(np.zeros(4))
+    for index in (1, 2):
+        lost = NotMeasured(reason="no points", in_damage=index != unseen)
+        sections[index] = replace(sections[index], stacking=None, measurands={"position_mm": lost})
+    line = blade_line(sections, alignment())
+    assert not line.bow_mm.measured.in_damage
+    assert not line.relative_twist[1].twist_deg.measured.in_damage
+
+
 def test_two_sections_have_a_lean_but_no_bow():
     line = blade_line(stack(np.zeros(4))[:2], alignment())
     assert isinstance(line.lean_x_deg.measured, Measurand)

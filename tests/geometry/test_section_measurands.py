@@ -133,6 +133,16 @@ def test_where_it_is_thickest_is_where_the_largest_disc_is():
     assert thickest_at(curve, pair, nose_tail_chord(curve, le, te)).value == pytest.approx(largest, abs=0.05)
 
 
+def test_the_stagger_of_a_blade_that_points_backwards_is_near_its_nominal():
+    chart = chart_of(BENT)
+    stagger_deg = define(chart.curve_mm, chart.side, SectionSettings()).nominals["stagger_deg"]
+    backwards = turned(chart.curve_mm, 179.9 - stagger_deg)
+    definition = define(backwards, chart.side, SectionSettings())
+    assert definition.nominals["stagger_deg"] == pytest.approx(179.9)
+    found = shape(turned(chart.curve_mm, 180.2 - stagger_deg), definition)["stagger_deg"]
+    assert found.value == pytest.approx(180.2, abs=1e-3)
+
+
 def test_thickness_at_a_distance_is_that_of_the_disc_there():
     chart = chart_of(STRAIGHT)
     found = shape(chart.curve_mm, define(chart.curve_mm, chart.side, SectionSettings()))

@@ -13,7 +13,7 @@ from geometry.types import Floats
 from station.clouds import BadScan
 from station.formats.write import ply_cloud, stl
 from station.inspect import Inspection, inspect_scan
-from station.plans import BadPlan
+from station.plans import BadPlan, read_plan
 from station.recipe import prepare_recipe
 from station.refusal import BadRequest
 from tests.geometry.blades import Blade, Scan, mesh, scan, with_noise, with_tip_cut
@@ -127,6 +127,12 @@ def test_a_section_off_the_nominal_is_refused(folder: Path, tmp_path: Path) -> N
         )
 
 
+def test_a_section_off_the_airfoil_is_refused(folder: Path) -> None:
+    (folder / "root.toml").write_text(PLAN.replace("z_min_mm = 4.0", "z_min_mm = 15.0"))
+    with pytest.raises(BadPlan, match=r"sections.z_mm: 8 mm is outside the airfoil, 15 to 35 mm"):
+        prepare_recipe(read_plan(folder / "root.toml"))
+
+
 def test_a_slide_of_the_thesis_registration_is_never_believed(folder: Path, tmp_path: Path) -> None:
     plan = folder / "thesis.toml"
     plan.write_text(PLAN.replace("[sections]", '[algorithms]\nregistration = "thesis"\n[sections]'))
@@ -143,8 +149,6 @@ def test_a_slide_of_the_thesis_registration_is_never_believed(folder: Path, tmp_
 
 
 def test_a_datum_point_off_the_nominal_is_a_bad_plan(folder: Path) -> None:
-    from station.plans import read_plan
-
     points = [[0.0, 0.0, 0.0]] * 5 + [[0.0, 0.0, 400.0]]
     table = f'[alignment]\nmethod = "six_point"\npoints_mm = {points}\n[sections]'
     (folder / "datum.toml").write_text(PLAN.replace("[sections]", table))

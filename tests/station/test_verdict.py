@@ -10,12 +10,13 @@ from hypothesis import strategies as st
 
 from geometry.damage.damages import DamageKind
 from geometry.sections.blade_line import BladeLine, Judged, RelativeTwist
-from geometry.types import Zone
+from geometry.types import Measured, Zone
 from station.findings import Finding, Outcome, described, outcome_of
 from station.gates import Acceptance, Cause, Gate
 from station.measurement import Measurement
 from station.plans import Limit
 from station.verdict import Verdict, Word, decide, judge
+from station.widen import widened
 from tests.station.parts import (
     GATES,
     LIMITS,
@@ -112,6 +113,13 @@ def test_noise_well_above_the_stated_sigma_holds() -> None:
     assert verdict(alignment=noisy, residual_mm=0.04).verdict == Word.HOLD
     assert verdict(alignment=noisy, residual_mm=float("nan")).verdict == Word.HOLD
     assert verdict(alignment=noisy, residual_mm=0.02).verdict == Word.PASS  # form, not noise
+
+
+def test_the_noise_of_a_datum_zone_is_not_that_of_the_scan() -> None:
+    rough = measurement(alignment=alignment(method="root", noise_mm=0.01), residual_mm=0.05)
+    root = plan(alignment={"method": "root", "datum_z_mm": [6.0, 22.0]})
+    assert judge(rough, plan(), GATES).verdict == Word.PASS
+    assert judge(rough, root, GATES).verdict == Word.HOLD
 
 
 def test_the_thresholds_of_acceptance_are_settings() -> None:
@@ -283,16 +291,17 @@ BLADE = {
 }
 
 
-def line(bow_mm: float, twists_deg: tuple[float, ...]) -> BladeLine:
+def line(bow_mm: float, twists_deg: tuple[Measured | float, ...]) -> BladeLine:
     """A straight blade with this bow and these twists, nominal 0.05 mm and 0."""
+    twists = [number("twist_deg", t) if isinstance(t, float) else t for t in twists_deg]
     none = Judged(measured=number("lean_x_deg", 0.0), nominal=0.0)
     return BladeLine(
         lean_x_deg=none,
         lean_y_deg=none,
         bow_mm=Judged(measured=number("bow_mm", bow_mm), nominal=0.05),
         relative_twist=tuple(
-            RelativeTwist(z_mm=(i, i + 1.0), twist_deg=Judged(measured=number("twist_deg", t), nominal=0.0))
-            for i, t in enumerate(twists_deg)
+            RelativeTwist(z_mm=(i, i + 1.0), twist_deg=Judged(measured=t, nominal=0.0))
+            for i, t in enumerate(twists)
         ),
     )
 
@@ -304,6 +313,12 @@ def line(bow_mm: float, twists_deg: tuple[float, ...]) -> BladeLine:
         (line(0.30, (0.1, -0.1)), Word.REPAIR),
         (line(0.10, (0.1, -0.5)), Word.REPAIR),
         (line(0.10, (0.1, -1.5)), Word.SCRAP),
+        (line(0.10, (lost(in_damage=True), -1.5)), Word.SCRAP),
+        (line(0.10, (lost(in_damage=True), -0.5)), Word.REPAIR),
+        (line(0.10, (lost(in_damage=True), 0.1)), Word.PASS),
+        (line(0.10, (lost(in_damage=True), lost())), Word.HOLD),
+        (line(0.10, (0.15, number("twist_deg", -0.149, 0.2))), Word.HOLD),
+        (line(0.10, (number("twist_deg", 1.6, 0.5), -1.5)), Word.SCRAP),
         (None, Word.HOLD),
     ],
 )
@@ -337,6 +352,13 @@ def test_bent_metal_is_judged_by_how_far_it_is_off_the_nominal(depth: float, wor
     assert not done.patches
 
 
+def test_what_merging_leaves_open_is_in_how_far_metal_is_bent() -> None:
+    bent = damage(kind=DamageKind.DEFORMATION, off_nominal=number("off_nominal_mm", 0.1, 0.01))
+    done = judge(widened(measurement(damages=(bent,)), 0.05), plan(), GATES)
+    assert pytest.approx(2.0 * np.hypot(0.01, 0.05)) == finding(done, "form.deviation_mm").U
+    assert done.verdict == Word.HOLD
+
+
 def test_bent_metal_that_could_not_be_measured_holds() -> None:
     bent = damage(kind=DamageKind.DEFORMATION, off_nominal=lost("no point is left"))
     assert verdict(damages=(bent,)).reasons == ("form: deviation: no point is left",)
@@ -354,8 +376,16 @@ def test_bent_metal_without_a_limit_of_form_needs_a_limited_section_on_it() -> N
         done = judge(given, plan(limits, z_mm=(z_mm,)), GATES)
         assert done.verdict == word
         if word == Word.HOLD:
-            text = "deformation at z 95.0 to 105.0 mm: neither form nor a section there has a limit"
+            text = "deformation at z 95.0 to 105.0 mm: neither form nor a section there was judged"
             assert text in done.reasons
+
+
+def test_a_section_without_a_number_judges_no_bent_metal() -> None:
+    bent = damage(kind=DamageKind.DEFORMATION, depth=99.0, volume=999.0)
+    scratched = section(100.0, chord_mm=lost(in_damage=True))
+    given = measurement(damages=(bent, damage(depth=0.2)), sections=(scratched,))
+    limits = {key: LIMITS[key] for key in ("damage", "section")}
+    assert judge(given, plan(limits, z_mm=(100.0,)), GATES).verdict == Word.HOLD
 
 
 def test_damage_off_the_airfoil_is_not_judged() -> None:
@@ -427,7 +457,23 @@ def test_only_damage_proven_deeper_than_the_least_depth_is_counted() -> None:
 def test_without_a_detection_limit_damages_are_not_counted() -> None:
     done = verdict(damages=(damage(),), detection_mm={})
     assert finding(done, "damage.tip.count").reason == "no detection limit"
-    assert finding(verdict(detection_mm={}), "damage.tip.count").value == 0.0
+    for size in ("count", "volume_mm3"):  # nor is nothing found a proof of nothing there
+        assert finding(verdict(detection_mm={}), f"damage.tip.{size}").outcome == Outcome.HOLD
+
+
+def test_a_limited_zone_of_which_no_surface_was_required_holds() -> None:
+    done = verdict(zones=tuple(coverage(zone) for zone in ZONES if zone != Zone.TIP))
+    assert done.verdict == Word.HOLD
+    assert done.reasons == ("tip: has limits, but no surface of it is required to be seen",)
+
+
+def test_what_closes_off_no_volume_on_the_skin_scraps_no_part() -> None:
+    fibre = damage(kind=DamageKind.EXCESS, depth=20.0, volume=lost("shows no way out"))
+    done = verdict(damages=(fibre,))
+    assert done.verdict == Word.HOLD
+    assert "tip: depth: its volume: shows no way out" in done.reasons
+    bead = damage(kind=DamageKind.EXCESS, depth=20.0, volume=30.0)
+    assert verdict(damages=(fibre, bead)).verdict == Word.SCRAP
 
 
 def test_form_or_excess_alone_is_reworked() -> None:
@@ -443,6 +489,10 @@ def test_the_largest_of_both_profile_deviations_is_judged() -> None:
     done = judge(measurement(sections=(worn,)), plan(limits), GATES)
     assert finding(done, "sections[7.0].profile_mm").value == -0.2
     assert done.reasons == ("section 7.0: profile 0.2 mm > serviceable 0.1 mm",)
+    ends = {"profile_max_mm": number("profile_max_mm", 0.07, 0.01)}
+    unsure = section(**ends, profile_min_mm=number("profile_min_mm", -0.06, 0.05))
+    done = judge(measurement(sections=(unsure,)), plan(limits), GATES)
+    assert (done.verdict, finding(done, "sections[7.0].profile_mm").value) == (Word.HOLD, -0.06)
     half = section(profile_max_mm=0.05, profile_min_mm=lost())
     assert judge(measurement(sections=(half,)), plan(limits), GATES).verdict == Word.HOLD
     bare = replace(section(), measurands={}, reason="no points")
