@@ -171,6 +171,8 @@ def calibrate(
         from station.calibration import calibrate_from, check_from
 
         now = datetime.now(UTC)
+        if check is not None and not bar_mm > 0.0:
+            raise typer.BadParameter("--check needs --bar-mm, the certified distance of the bar's two balls")
         if check is not None:
             line = check_from(spheres, check, bar_mm, out, now)
         elif scanner_serial is not None:

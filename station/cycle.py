@@ -96,10 +96,10 @@ def release(cell: Cell, committed: CommittedVerdict, durations_s: dict[str, floa
 
 def publish(cell: Cell, committed: CommittedVerdict) -> None:
     """Puts a committed verdict into the registers, now or again after a restart."""
-    ticket, now_s = committed.ticket, cell.clock()
+    ticket, now_s, block = committed.ticket, cell.clock(), result_block(committed)
     cell.shake = shaking.published(cell.shake, ticket.sequence, ticket.serial, now_s)
     bits = shaking.status(cell.shake, cell.plc.request(), cell.health(now_s))
-    cell.plc.publish(result_block(committed), bits)
+    cell.plc.publish(block, bits)
     cell.fire(Trigger.PUBLISHED)
     cell.moved.set()
 

@@ -161,7 +161,18 @@ def recover(record: Record, now: datetime) -> tuple[tuple[Request, ...], Committ
 
     A committed verdict that was not acknowledged is shown again as it was; nothing is measured again."""
     interrupted = tuple(request for request in record.requests() if request.decision is None)
-    for request in interrupted:
-        close_unjudged(record, request.record_no, 131, "the station ended during the inspection", now)
+    close_abandoned(record, "the station ended during the inspection", now, shown=True)
     standing = [request for request in record.requests() if request.stands]
     return interrupted, record.committed(standing[-1].record_no) if standing else None
+
+
+def close_abandoned(record: Record, why: str, now: datetime, *, shown: bool) -> None:
+    """Closes what was begun and never shown: no verdict of it may come back later.
+
+    `shown`: that of the newest request stands in the registers, or is to be shown again."""
+    requests = record.requests()
+    for request in requests:
+        newest = request is requests[-1]
+        hidden = request.phase == "DECIDED" and request.stands and not (shown and newest)
+        if hidden or request.decision is None:
+            close_unjudged(record, request.record_no, 131, why, now)

@@ -6,8 +6,10 @@ run_forever ── operate ── serve ── serve_next ── serve_request �
 
 import asyncio
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from datetime import UTC, datetime
+from typing import Any
 
 from drivers.errors import DeviceFault, DriverError, LinkDown
 from drivers.wire.plc import Ctrl, PlcRequest
@@ -20,7 +22,7 @@ from station.cycle import LOAD_DEG, PartInterrupted, in_place, publish, run_part
 from station.daily import daily_gate
 from station.events import PartStarted
 from station.handshake import Phase
-from station.job import begin_job, close_unjudged, recover
+from station.job import begin_job, close_abandoned, close_unjudged, recover
 from station.phases import Trigger
 from station.reasons import Unfit, alarm_number
 from station.record import Ticket
@@ -30,6 +32,7 @@ MIN_FREE_BYTES = 256 << 20
 SHOWN_PARTS = 20
 
 _SERVED = (Phase.ACCEPTING, Phase.PUBLISHED, Phase.ACKING)
+SHOWN = (Phase.PUBLISHED, Phase.ACKING, Phase.CLEARING)  # a verdict stands in the registers
 
 
 async def run_forever(cell: Cell) -> None:
@@ -154,7 +157,9 @@ async def serve_request(cell: Cell, request: PlcRequest) -> None:
         cell.part = asyncio.create_task(inspect_part(cell, recipe, ticket, record_no))
         await cell.part
     except (asyncio.CancelledError, PartInterrupted):
-        await break_off(cell, record_no)
+        await to_its_end(break_off(cell, record_no))
+        if asked_to_end():
+            raise asyncio.CancelledError from None
         if cell.interrupt is None:
             raise
     finally:
@@ -180,11 +185,26 @@ async def inspect_part(cell: Cell, recipe: RecipeFile, ticket: Ticket, record_no
     await run_part(cell, recipe, job)
 
 
+async def to_its_end(closing: Coroutine[Any, Any, None]) -> None:
+    """Awaits what must not be left half done, however often this task is asked to end meanwhile."""
+    task = asyncio.ensure_future(closing)
+    while not task.done():
+        with suppress(asyncio.CancelledError):
+            await asyncio.shield(task)
+    task.result()
+
+
+def asked_to_end() -> bool:
+    """Whether this task itself was cancelled, not one that it awaited."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
+
+
 async def break_off(cell: Cell, record_no: int) -> None:
     """Stops the table and closes a request that was interrupted: without a verdict, whatever was decided.
 
-    One whose verdict already stands in the registers is past interruption."""
-    if cell.shake.phase in (Phase.PUBLISHED, Phase.ACKING, Phase.CLEARING):
+    One whose verdict already stands in the registers, or was taken from there, is past interruption."""
+    if cell.shake.phase in SHOWN or cell.record.request(record_no).phase not in ("ACCEPTED", "DECIDED"):
         return
     cell.shake = shaking.broken_off(cell.shake)
     show_status(cell)
@@ -230,11 +250,13 @@ def announce(cell: Cell, ticket: Ticket, recipe: RecipeFile, record_no: int) -> 
 
 async def watch(cell: Cell, holds: Callable[[], bool]) -> None:
     """Returns when `holds`; meanwhile looks after the devices once a second."""
-    while not await cell.until(lambda: holds() or cell.jog_deg is not None, CHECK_S):
-        await check_devices(cell)
-    if cell.jog_deg is not None:
-        await jog(cell)
-        await watch(cell, holds)
+    while True:
+        if not await cell.until(lambda: holds() or cell.jog_deg is not None, CHECK_S):
+            await check_devices(cell)
+        elif cell.jog_deg is not None:
+            await jog(cell)
+        else:
+            return
 
 
 async def check_devices(cell: Cell) -> None:
@@ -295,6 +317,8 @@ async def cleared(cell: Cell) -> bool:
     cell.fire(Trigger.RESET)
     try:
         await cell.on_disk(cell.record.reopen)
+        now, shown = datetime.now(UTC), cell.shake.phase in SHOWN
+        await cell.on_disk(close_abandoned, cell.record, "a fault ended the inspection", now, shown=shown)
         await cell.connect()
         check_fit(cell)
     except (DriverError, RecordFailed, Unfit) as error:

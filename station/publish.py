@@ -36,8 +36,9 @@ def figures(measurement: Measurement, verdict: Verdict) -> Figures:
     missing = [d.volume_mm3 for d in damages if d.kind.value == "missing"]
     return Figures(
         worst_um=_worst_um(verdict),
-        missing_mm3_x1000=min(
-            round(1000.0 * sum(volume.value for volume in missing if isinstance(volume, Measurand))), _U32
+        missing_mm3_x1000=max(
+            0,
+            min(round(1000.0 * sum(each.value for each in missing if isinstance(each, Measurand))), _U32),
         ),
         defects=min(len(damages), _U16),
         coverage_x100=min((round(10_000.0 * zone.covered_fraction) for zone in measurement.zones), default=0),

@@ -19,7 +19,9 @@ SECTION = {
     "le_radius_mm": 406,
     "te_radius_mm": 407,
 }
+OTHER_OF_SECTION = 409
 FORM = 410
+BLADE = 460
 DAMAGE = {"tip": 420, "leading_edge": 430, "trailing_edge": 440, "surface": 450}
 SIZE = {"depth_mm": 1, "volume_mm3": 2, "count": 3}
 
@@ -51,7 +53,9 @@ def characteristic_number(name: str) -> int:
     if place == "form":
         return FORM
     if place.startswith("sections["):
-        return SECTION[key]
+        return SECTION.get(key, OTHER_OF_SECTION)
+    if place == "blade":
+        return BLADE
     return DAMAGE[place.removeprefix("damage.")] + SIZE[key]
 
 

@@ -25,6 +25,7 @@ from station.events import (
     ViewCaptured,
 )
 from station.journal import job_folder
+from station.operate import to_its_end
 from station.record import AnotherStation, Request, read_requests, verify
 
 if TYPE_CHECKING:
@@ -351,3 +352,18 @@ async def test_maintenance_is_never_ready(station: Stations, tmp_path: Path) -> 
         await asyncio.sleep(0.3)
         assert not await rig.plc.status() & (START_ACK | BUSY)
         assert rig.of(StationStatus)[-1].state == "IDLE"  # type: ignore[union-attr]
+
+
+async def test_what_closes_a_request_is_done_to_its_end_however_often_it_is_stopped() -> None:
+    done: list[str] = []
+
+    async def closing() -> None:
+        await asyncio.sleep(0.05)
+        done.append("closed")
+
+    task = asyncio.create_task(to_its_end(closing()))
+    for _ in range(2):
+        await asyncio.sleep(0.01)
+        task.cancel()
+    await task
+    assert done == ["closed"]

@@ -17,11 +17,14 @@ from station.chain import RecordBroken, RecordFailed
 from station.gates import Gate, Gates
 from station.job import decided, finding_row
 from station.numbers import differences, numbers
+from station.plans import SECTION_KEYS, BladeLimits
 from station.proof import Figures, unproven
 from station.publish import figures, result_block
 from station.reasons import (
+    BLADE,
     DAMAGE,
     FORM,
+    OTHER_OF_SECTION,
     SECTION,
     SIZE,
     Unfit,
@@ -54,7 +57,8 @@ def test_the_manual_tables_every_number() -> None:
     page = (ROOT / "docs" / "wire" / "plc.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| (\d+) \| (.*?) \|", page[page.index("## REASON") :], re.MULTILINE))
     sizes = {zone + size for zone in DAMAGE.values() for size in SIZE.values()}
-    assert {int(number) for number in rows} == set(KINDS) | set(SECTION.values()) | {FORM} | sizes
+    others = {OTHER_OF_SECTION, FORM, BLADE}
+    assert {int(number) for number in rows} == set(KINDS) | set(SECTION.values()) | others | sizes
     assert all(rows[str(number)] == kind.text for number, kind in KINDS.items())
 
 
@@ -70,6 +74,12 @@ def test_the_manual_tables_every_number() -> None:
 )
 def test_characteristics_have_numbers(name: str, number: int) -> None:
     assert characteristic_number(name) == number
+
+
+def test_whatever_a_plan_can_limit_has_a_number() -> None:
+    keys = {*SECTION_KEYS, "le_thickness_at_2_mm"}
+    assert all(characteristic_number(f"sections[7.0].{key}") in range(401, 410) for key in keys)
+    assert {characteristic_number(f"blade.{key}") for key in BladeLimits.model_fields} == {BLADE}
 
 
 SCRAPPED = {"damages": (parts.damage(zone=Zone.SURFACE, depth=6.0),)}

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 
 from station.chain import RecordBroken, RecordFailed
 from station.events import FindingRow
+from station.job import close_abandoned, recover
 from station.journal import job_folder, keep_json
 from station.proof import Decision, unproven
 from station.record import (
@@ -61,6 +63,39 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def directory(tmp_path: Path, template: Path) -> Path:
     """A record with the requests of the workload."""
     return shutil.copytree(template, tmp_path / "record")
+
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+def decided(record: Record, sequence: int, word: str) -> int:
+    """A request whose verdict is committed and was never shown."""
+    number = int(record.accept(workload.ticket(sequence)))
+    record.decide(number, workload.decision(word))
+    return number
+
+
+def test_a_verdict_that_a_fault_kept_back_never_comes_back(tmp_path: Path) -> None:
+    record = opened(tmp_path)
+    first, second = decided(record, 1, "PASS"), record.accept(workload.ticket(2))
+    close_abandoned(record, "a fault", NOW, shown=False)
+    assert record.request(first).phase == "UNDELIVERED"
+    assert record.request(second).verdict == "HOLD"
+    assert recover(record, NOW) == ((), None)
+    record.close()
+
+
+def test_only_the_newest_verdict_is_shown_again_after_a_restart(tmp_path: Path) -> None:
+    record = opened(tmp_path)
+    first, second = decided(record, 1, "PASS"), decided(record, 2, "SCRAP")
+    _, standing = recover(record, NOW)
+    assert standing is not None
+    assert standing.record_no == second
+    assert record.request(first).phase == "UNDELIVERED"
+    record.published(second, AT)
+    record.acked(second, 1, AT)
+    assert recover(record, NOW) == ((), None)
+    record.close()
 
 
 def test_a_request_runs_from_accepted_to_acked(tmp_path: Path) -> None:
