@@ -13,7 +13,14 @@ from geometry.errors import CannotMeasure
 from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.chart import Chart, SectionSettings, unroll
 from geometry.sections.curve import Estimate, centroid, node_shares
-from geometry.sections.form import PROFILE_EXTREMES, SIDES, extreme_sigmas, flattened_mm, share_beyond_sigma
+from geometry.sections.form import (
+    PROFILE_EXTREMES,
+    SIDES,
+    extreme_sigmas,
+    flattened_mm,
+    share_beyond_sigma,
+    with_pose,
+)
 from geometry.sections.measurands import SECTION_MEASURANDS, Definition, define, form, place, shape
 from geometry.sections.profile import (
     Gap,
@@ -198,7 +205,7 @@ def _uncertainty(profile: Profile, estimates: Mapping[str, Estimate], alignment:
         own=profile.covariance(gradients),
         pose=gradients @ growth,
         pose_covariance=twist,
-        node_sigma_mm=np.sqrt(profile.node_sigmas() ** 2 + ((growth @ twist) * growth).sum(axis=1)),
+        node_sigma_mm=with_pose(profile.node_sigmas(), growth, twist),
     )
 
 

@@ -57,6 +57,13 @@ def highest_sigma(deviation_mm: Floats, part: Bools, sigma_mm: Floats) -> float:
     return float(farther / FARTHER)
 
 
+def with_pose(sigma_mm: Floats, growth: Floats, twist: Floats) -> Floats:
+    """Sigmas (m,) of nodes that are each known to `sigma_mm` on a part whose pose has the covariance `twist`
+    (6, 6), by which they grow as `growth` (m, 6)."""
+    both: Floats = np.sqrt(sigma_mm**2 + ((growth @ twist) * growth).sum(axis=1))
+    return both
+
+
 def _at(deviation_mm: Floats, node: int) -> Estimate:
     gradient = np.zeros(len(deviation_mm))
     gradient[node] = 1.0

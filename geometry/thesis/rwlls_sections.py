@@ -15,7 +15,7 @@ from geometry.registration.alignment import Alignment, pose_covariance
 from geometry.sections.airfoil import Section, SectionStatus
 from geometry.sections.chart import NODES, Chart, SectionSettings, outward_normals, unroll
 from geometry.sections.curve import Estimate, node_shares
-from geometry.sections.form import extreme_sigmas, share_beyond_sigma
+from geometry.sections.form import extreme_sigmas, share_beyond_sigma, with_pose
 from geometry.sections.measurands import Definition, define, form, place, shape
 from geometry.sections.motion import find_motion
 from geometry.sections.profile import Gap, Scan, explain_gaps, find_gaps, scan_of
@@ -210,7 +210,7 @@ def _sigmas(
     noise = _Noise(profile=profile, t=traced.t, normals=outward_normals(traced.curve_mm))
     growth, twist = chart.pose_growth(traced.curve_mm, alignment.pivot_mm), pose_covariance(alignment)
     covariance = noise.covariance(gradients) + gradients @ growth @ twist @ growth.T @ gradients.T
-    node_sigma_mm = np.sqrt(noise.node_sigmas() ** 2 + ((growth @ twist) * growth).sum(axis=1))
+    node_sigma_mm = with_pose(noise.node_sigmas(), growth, twist)
     names, waves = list(estimates), definition.waves
     sigmas = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     xy = [names.index("position_x_mm"), names.index("position_y_mm")]
