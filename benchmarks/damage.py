@@ -14,7 +14,8 @@ import sys
 
 import numpy as np
 
-from geometry.damage.damages import HOLLOW_SPACINGS, detection_limit, find_damages
+from geometry.damage.damages import find_damages
+from geometry.damage.detection import HOLLOW_SPACINGS, detection_limit
 from geometry.deformation.twin import TwinSettings, fit_twin
 from geometry.types import Measurand, Zone
 from tests.geometry import twin_blades as blades
@@ -58,7 +59,7 @@ def hollows(limits: float, spacings: float, pitch_mm: float, noise_mm: float, se
         cloud = cloud_of(scan.points, noise_mm)
         twin = fit_twin(cloud, scan.label > 0, in_place(), nominal(), TwinSettings())
         if not seed:
-            limit = detection_limit(cloud, twin)[Zone.SURFACE]
+            limit = detection_limit(cloud, in_place(), nominal(), twin)[Zone.SURFACE]
             assert isinstance(limit, Measurand)
             depth_mm = limits * limit.value
             continue

@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
 from geometry.coverage import measure_coverage
-from geometry.damage.damages import Damage, DamageKind, detection_limit, find_damages
+from geometry.damage.damages import Damage, DamageKind, find_damages
+from geometry.damage.detection import detection_limit
 from geometry.deformation.twin import Twin
 from geometry.errors import CannotMeasure
 from geometry.registration.alignment import Alignment
@@ -85,7 +86,9 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
     mask = run.step("mask", mask_damage, points, alignment, nominal)
     twin = run.step("twin", make_twin, points, mask, alignment, recipe)
     damages = run.step("damage", find_damages, points, mask, alignment, nominal, twin, recipe.damage_settings)
-    detection = run.step("detection", detection_limit, points, twin, recipe.damage_settings)
+    detection = run.step(
+        "detection", detection_limit, points, alignment, nominal, twin, recipe.damage_settings.regions
+    )
     repairs = run.step("repair", find_repairs, twin, points, alignment, damages, recipe.repair_settings)
     sections = run.step(
         "sections", inspected, points, mask, alignment, recipe, twin=twin, damages=damages, repairs=repairs

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from geometry.blade.nominal import ZONE_ORDER, Nominal
 from geometry.damage.bends import BendSettings, bend_depth, bend_off_nominal, bent_pairs
 from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, reaches_edge, span_depth
-from geometry.damage.detection import edge_limit_mm, tip_limit_mm
+from geometry.damage.detection import PRECEDENCE
 from geometry.damage.excess import excess_volume
 from geometry.damage.normal_depth import normal_depth
 from geometry.damage.regions import (
@@ -18,26 +18,19 @@ from geometry.damage.regions import (
     Region,
     RegionSettings,
     find_regions,
-    noise_of,
-    spacing_of,
     stand_off,
 )
 from geometry.deformation.twin import Twin
 from geometry.registration.alignment import Alignment
-from geometry.scan.neighbourhood import nearest_of
 from geometry.threads import one_blas_thread
 from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotMeasured, Zone
 
-PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
 NOT_AN_EDGE = NotMeasured(reason="no loss of an edge")
 NOT_SOUGHT = NotMeasured(reason="was not looked for")
 NOT_BENT = NotMeasured(reason="not bent")
 ALONE = NotMeasured(reason="no other damage")
-HOLLOW_SPACINGS = 12.0  # width of the hollow, in point spacings, that the detection limit is stated for
-KEPT = 0.8  # of the depth of such a hollow is left in the mean over a neighbourhood
 EDGES = (Zone.LEADING_EDGE, Zone.TRAILING_EDGE)
 PROVEN = 2.0  # sigmas of the loss of an edge
-PRECEDENCE = (Zone.TIP, *EDGES, Zone.SURFACE)
 
 
 class DamageKind(StrEnum):
@@ -96,37 +89,6 @@ def find_damages(
     damages = [_described(region, found, nominal, twin, settings) for region in single]
     damages += [_bent(a, b, found, nominal, alignment, settings) for a, b in bent]
     return _spaced(damages, found)
-
-
-def detection_limit(
-    cloud: Cloud, twin: Twin, settings: DamageSettings = DamageSettings()
-) -> dict[Zone, Measured]:
-    """The depth per zone that is found with 95 % probability at the noise and density of this scan.
-
-    Stated for a hollow that runs out smoothly over `HOLLOW_SPACINGS`; a narrower one must be deeper. It is
-    found when the mean over a neighbourhood, which flattens it, passes `high` sigmas; it must exceed that by
-    the quantile of the noise of one such mean. Edges and a thin tip must lose more: their loss leaves a
-    narrow strip.
-    """
-    if not twin.supported.any():
-        return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
-    regions = settings.regions
-    mean_mm = max(noise_of(cloud, twin) / np.sqrt(regions.neighbours + 1), regions.floor_mm)
-    sigma_mm = float(np.hypot(mean_mm, np.quantile(twin.sigma_mm[twin.supported], 0.95)))
-    hollow_mm = (regions.high + PROBABLE) * sigma_mm / KEPT
-    neighbours = nearest_of(cloud, min(regions.neighbours + 1, len(cloud)))
-    spacing_mm = spacing_of(cloud, neighbours)
-    across_mm = spacing_mm * float(np.sqrt(neighbours.shape[1] * 4.0 / np.pi))
-    edge_mm = edge_limit_mm(twin, hollow_mm, across_mm)
-    tip_mm = tip_limit_mm(twin, hollow_mm, across_mm, HOLLOW_SPACINGS * spacing_mm)
-    limits_mm = (tip_mm, edge_mm, edge_mm, hollow_mm)
-    return {zone: _limit(zone, limit_mm) for zone, limit_mm in zip(PRECEDENCE, limits_mm, strict=True)}
-
-
-def _limit(zone: Zone, value_mm: float) -> Measured:
-    if not np.isfinite(value_mm):
-        return NotMeasured(reason="no loss of an edge would show")
-    return Measurand(name=f"{zone}_detection", value=value_mm, sigma=0.0, unit="mm")
 
 
 def _described(

@@ -1,14 +1,103 @@
-"""The least loss of an edge and of the tip that a scan shows."""
+"""The least damage of each zone that a scan shows."""
+
+from collections.abc import Iterator
 
 import numpy as np
 
+from geometry.blade.nominal import ZONE_ORDER, Nominal
 from geometry.damage.depth import dense, outline_mm
+from geometry.damage.regions import RegionSettings, local_spacing_of, noise_of
 from geometry.deformation.twin import Twin
-from geometry.types import Floats
+from geometry.registration.alignment import Alignment
+from geometry.scan.neighbourhood import nearest_of
+from geometry.transforms import apply
+from geometry.types import Cloud, Floats, Measurand, Measured, NotMeasured, Zone
 
+PRECEDENCE = (Zone.TIP, Zone.LEADING_EDGE, Zone.TRAILING_EDGE, Zone.SURFACE)
+PROBABLE = 1.645  # one-sided 95 % quantile of the normal distribution
+HOLLOW_SPACINGS = 12.0  # width of the hollow, in usual point spacings, that the detection limit is stated for
+LEAST_SPACINGS = 4.0  # that width in the spacings of the thinnest place: fewer points are no region
+BESIDE = 0.965  # of what a neighbourhood in the middle of a hollow shows, one about the nearest point does
 SPAN = (0.1, 0.3, 0.5, 0.7, 0.9)  # shares of the span that is seen, at which the edges are asked
 TIP = 0.98  # and the tip
 SHOWN = 0.8  # of the mean depth of a strip: few points fall on it, and by chance (simulated, for 95 %)
+
+
+def detection_limit(
+    cloud: Cloud,
+    alignment: Alignment,
+    nominal: Nominal,
+    twin: Twin,
+    settings: RegionSettings = RegionSettings(),
+) -> dict[Zone, Measured]:
+    """The depth (mm) per zone that is found with 95 % probability at the noise and density of this scan.
+
+    Stated for a hollow that runs out smoothly over `HOLLOW_SPACINGS` of the usual spacings; a narrower one
+    must be deeper. It is found when the mean over a neighbourhood, which flattens it, passes `high` sigmas;
+    it must exceed that by the quantile of the noise of one such mean. On a side this holds in the place where
+    the points lie farthest apart. Edges and a thin tip must lose more, for their loss leaves a narrow strip:
+    theirs is stated for the usual spacing, and not at all where a place is too thin for any hollow.
+    """
+    if not twin.supported.any():
+        return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
+    mean_mm = max(noise_of(cloud, twin) / np.sqrt(settings.neighbours + 1), settings.floor_mm)
+    sigma_mm = float(np.hypot(mean_mm, np.quantile(twin.sigma_mm[twin.supported], 0.95)))
+    mean_limit_mm = (settings.high + PROBABLE) * sigma_mm
+    neighbours = nearest_of(cloud, min(settings.neighbours + 1, len(cloud)))
+    local_mm = local_spacing_of(cloud, neighbours)
+    usual_mm = float(np.median(local_mm))
+    width_mm = HOLLOW_SPACINGS * usual_mm
+    found: dict[Zone, Measured] = {}
+    for zone, thinnest_mm in _thinnest_mm(
+        apply(alignment.T_nominal_scan, cloud.points_mm), local_mm, nominal, twin
+    ):
+        spacing_mm = thinnest_mm if zone is Zone.SURFACE else usual_mm
+        across_mm = spacing_mm * float(np.sqrt(neighbours.shape[1] * 4.0 / np.pi))
+        hollow_mm = mean_limit_mm / (BESIDE * kept(across_mm / width_mm))
+        if width_mm < LEAST_SPACINGS * thinnest_mm:
+            found[zone] = NotMeasured(reason=f"points lie {thinnest_mm:.2f} mm apart in places")
+        else:
+            found[zone] = _limit(zone, _limit_mm(zone, hollow_mm, across_mm, width_mm, twin))
+    return found
+
+
+def _thinnest_mm(
+    scan_mm: Floats, local_mm: Floats, nominal: Nominal, twin: Twin
+) -> Iterator[tuple[Zone, float]]:
+    """For each zone the spacing that the points of its sound surface exceed only over less than a hollow."""
+    usual_mm = float(np.median(local_mm))
+    thin = np.flatnonzero(twin.sound & (local_mm > usual_mm))
+    codes = nominal.zone_of(scan_mm[thin])
+    hollow_mm2 = 0.25 * np.pi * (HOLLOW_SPACINGS * usual_mm) ** 2
+    for zone in PRECEDENCE:
+        there_mm = np.sort(local_mm[thin[codes == ZONE_ORDER.index(zone)]])[::-1]
+        within = int(np.searchsorted(np.cumsum(there_mm**2), hollow_mm2))
+        yield zone, float(there_mm[within]) if within < len(there_mm) else usual_mm
+
+
+def _limit_mm(zone: Zone, hollow_mm: float, across_mm: float, width_mm: float, twin: Twin) -> float:
+    match zone:
+        case Zone.SURFACE:
+            return hollow_mm
+        case Zone.TIP:
+            return tip_limit_mm(twin, hollow_mm, across_mm, width_mm)
+        case _:
+            return edge_limit_mm(twin, hollow_mm, across_mm)
+
+
+def kept(share: float) -> float:
+    """Mean depth of a hollow, cosine-shaped and 1 deep in its middle, over a disc there whose width is so
+    large a share of the hollow's."""
+    if share > 1.0:
+        return (0.5 - 2.0 / np.pi**2) / share**2
+    turn = np.pi * share
+    return float(0.5 + np.sin(turn) / turn + (np.cos(turn) - 1.0) / turn**2)
+
+
+def _limit(zone: Zone, value_mm: float) -> Measured:
+    if not np.isfinite(value_mm):
+        return NotMeasured(reason="no loss of an edge would show")
+    return Measurand(name=f"{zone}_detection", value=value_mm, sigma=0.0, unit="mm")
 
 
 def edge_limit_mm(twin: Twin, hollow_mm: float, across_mm: float) -> float:

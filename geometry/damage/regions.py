@@ -38,12 +38,17 @@ class RegionSettings:
     skirt: float = 2.0
     floor_mm: float = 0.008  # least standard deviation: what the scanner's own errors do not average out
     least_points: int = 12
+    fewest_points: int = (
+        4  # are a region, where each stands for so much surface that they equal `least_points`
+    )
     join_mm: float = 1.0  # metal nearer than this to other such metal, or to the skin, belongs to it
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.skirt <= self.low <= self.high and min(self.neighbours, self.least_points) >= 4):
+        if not (0.0 < self.skirt <= self.low <= self.high and min(self.neighbours, self.fewest_points) >= 4):
             raise BadInput(f"regions: {self} contradicts itself")
         if not (self.floor_mm > 0.0 and self.join_mm > 0.0):
+            raise BadInput(f"regions: {self} contradicts itself")
+        if self.fewest_points > self.least_points:
             raise BadInput(f"regions: {self} contradicts itself")
 
 
@@ -54,6 +59,7 @@ class Field:
     scan_mm: Floats  # (n, 3)
     neighbours: Ints  # (n, k), -1 none
     spacing_mm: float  # between neighbouring points
+    local_mm: Floats  # (n,) that spacing about each point
     noise_mm: float  # of a single point
     height_mm: Floats  # (n,) distance of each point
     smooth_mm: Floats  # (n,) mean distance over the neighbourhood
@@ -85,6 +91,7 @@ def stand_off(
         scan_mm=scan_mm,
         neighbours=neighbours,
         spacing_mm=spacing_of(cloud, neighbours),
+        local_mm=local_spacing_of(cloud, neighbours),
         noise_mm=noise_mm,
         height_mm=distance_mm,
         smooth_mm=neighbourhood_mean(distance_mm, neighbours[:, 1:]),
@@ -101,9 +108,25 @@ def noise_of(cloud: Cloud, twin: Twin) -> float:
 
 def spacing_of(cloud: Cloud, neighbours: Ints) -> float:
     """Spacing (mm) of the points, from the farthest of their neighbours (n, k; -1 none)."""
-    whole = np.flatnonzero(neighbours[:, -1] >= 0)
-    apart_mm = np.linalg.norm(cloud.points_mm[whole] - cloud.points_mm[neighbours[whole, -1]], axis=1)
-    return float(np.median(apart_mm) * np.sqrt(np.pi / neighbours.shape[1]))
+    return float(np.median(_spacings(cloud, neighbours)))
+
+
+def local_spacing_of(cloud: Cloud, neighbours: Ints) -> Floats:
+    """Spacing (n,) (mm) of the points about each point: what most of its neighbours (n, k; -1 none) have, for
+    few points that lie apart tell nothing of a surface."""
+    everywhere = np.ones(len(cloud), np.bool_)
+    return neighbourhood_median(_spacings(cloud, neighbours), neighbours, everywhere)
+
+
+def _spacings(cloud: Cloud, neighbours: Ints) -> Floats:
+    """Spacing (n,) about each point, from the farthest of its neighbours (n, k; itself first, -1 none)."""
+    squares_mm2, known = np.zeros(len(cloud)), np.zeros(len(cloud))
+    for other in neighbours.T:
+        there = other >= 0
+        apart_mm = cloud.points_mm[np.where(there, other, 0)] - cloud.points_mm
+        squares_mm2 = np.maximum(squares_mm2, np.where(there, np.einsum("ij,ij->i", apart_mm, apart_mm), 0.0))
+        known += there
+    return np.asarray(np.sqrt(np.pi * squares_mm2 / np.maximum(known, 1.0)))
 
 
 def find_regions(field: Field, nominal: Nominal, settings: RegionSettings) -> list[Region]:
@@ -144,7 +167,15 @@ def _connected(mean_mm: Floats, own_mm: Floats, field: Field, settings: RegionSe
     chosen = np.flatnonzero(wider | (reached & (gentle | (own_mm > 0.5 * mean_mm))))
     labels = _labels(chosen, field, max(LINK_SPACINGS * field.spacing_mm, settings.join_mm))
     groups = [chosen[labels == label] for label in np.unique(labels)]
-    return [group for group in groups if len(group) >= settings.least_points]
+    return [group for group in groups if _is_region(group, field, settings)]
+
+
+def _is_region(points: Ints, field: Field, settings: RegionSettings) -> bool:
+    """Whether they are `least_points`, or where the scan is thin, stand for as much surface as so many do."""
+    if len(points) < settings.fewest_points:
+        return False
+    usual = float(np.sum((field.local_mm[points] / field.spacing_mm) ** 2))
+    return len(points) >= settings.least_points or usual >= settings.least_points
 
 
 def _labels(chosen: Ints, field: Field, link_mm: float) -> Ints:

@@ -4,7 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from geometry.damage.damages import Damage, DamageKind, detection_limit, find_damages
+from geometry.damage.damages import Damage, DamageKind, find_damages
+from geometry.damage.detection import detection_limit
 from geometry.deformation.twin import TwinSettings, fit_twin
 from geometry.types import Bools, Measurand, Zone
 from tests.geometry import twin_blades as blades
@@ -24,7 +25,7 @@ def found() -> tuple[tuple[Damage, ...], Bools, dict[Zone, object]]:
     cloud, mask = cloud_of(scan.points, NOISE_MM), scan.label > 0
     twin = fit_twin(cloud, mask, in_place(), nominal(), TwinSettings())
     damages = find_damages(cloud, mask, in_place(), nominal(), twin)
-    return damages, mask, detection_limit(cloud, twin)
+    return damages, mask, detection_limit(cloud, in_place(), nominal(), twin)
 
 
 def test_the_broken_corner_and_the_pit_are_found_in_their_zones_and_nothing_else() -> None:

@@ -4,10 +4,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from geometry.damage.damages import HOLLOW_SPACINGS, Damage, detection_limit, find_damages
+from geometry.damage.damages import Damage, find_damages
+from geometry.damage.detection import HOLLOW_SPACINGS, detection_limit, kept
+from geometry.damage.regions import RegionSettings
 from geometry.deformation.twin import TwinSettings, fit_twin
-from geometry.types import Bools, Floats, Measurand, Zone
+from geometry.types import Bools, Cloud, Floats, Measurand, Measured, NotMeasured, Zone
 from tests.geometry import twin_blades as blades
 from tests.geometry.airfoils import cloud_of
 from tests.geometry.poses import in_place
@@ -48,7 +51,7 @@ def scanned(depth_mm: float, width_mm: float, seed: int) -> Case:
     deep = blades.hollow_depth(scan.points, centres, depth_mm, width_mm)
     broken = scan.points[scan.label > 0]
     deep[scan.label > 0] = np.minimum(-truth.distance(broken), blades.SPAN_MM - broken[:, 2])
-    limit = detection_limit(cloud, twin)[Zone.SURFACE]
+    limit = detection_limit(cloud, in_place(), nominal(), twin)[Zone.SURFACE]
     assert isinstance(limit, Measurand)
     return Case(damages, centres, told, deep, limit)
 
@@ -84,3 +87,68 @@ def test_the_depth_of_a_hollow_is_within_its_uncertainty() -> None:
     errors = np.array([(d.value - 0.1) / d.sigma for d in depths if isinstance(d, Measurand)])
     assert len(errors) == len(case.centres)
     assert np.abs(errors).max() < 3.0
+
+
+THIN_MM, HOLLOW_MM = 10.0, 4.0
+
+
+@cache
+def thinly_scanned(spacing_mm: float) -> tuple[Cloud, Floats]:
+    """A hollow 0.5 deep on a side, whose points within `THIN_MM` lie no nearer to each other than so."""
+    whole = blades.SHAPES["service"]
+    centre = whole.surface(np.array([0.65 * np.pi]), np.array([45.0])).reshape(1, 3)
+    hollowed = blades.hollowed(whole, centre, 0.5, HOLLOW_MM)
+    scan = blades.scan(
+        blades.Truth(whole), (), pitch_mm=PITCH_MM, noise_mm=NOISE_MM, scanned=hollowed, seed=5
+    )
+    near = np.flatnonzero(np.linalg.norm(scan.points - centre, axis=1) < THIN_MM)
+    tree = cKDTree(scan.points[near])
+    kept_points = np.ones(len(near), np.bool_)
+    for i in np.random.default_rng(5).permutation(len(near)):
+        if kept_points[i]:
+            others = [j for j in tree.query_ball_point(scan.points[near[i]], spacing_mm) if j != i]
+            kept_points[others] = False
+    return cloud_of(np.delete(scan.points, near[~kept_points], axis=0), NOISE_MM), centre
+
+
+def found_thinly(spacing_mm: float) -> tuple[tuple[Damage, ...], Floats, dict[Zone, Measured]]:
+    cloud, centre = thinly_scanned(spacing_mm)
+    nothing = np.zeros(len(cloud), np.bool_)
+    twin = fit_twin(cloud, nothing, in_place(), nominal(), TwinSettings())
+    limits = detection_limit(cloud, in_place(), nominal(), twin)
+    return find_damages(cloud, nothing, in_place(), nominal(), twin), centre, limits
+
+
+def test_a_hollow_is_found_where_the_scan_is_thin() -> None:
+    damages, centre, _ = found_thinly(0.9)
+    assert len(damages) == 1
+    assert np.linalg.norm(damages[0].centroid_mm - centre) < 0.5 * HOLLOW_MM
+    assert len(damages[0].points) < RegionSettings().least_points
+
+
+def test_the_limit_of_a_side_is_that_of_its_thinnest_place() -> None:
+    whole, thin, none = (found_thinly(spacing)[2] for spacing in (0.0, 0.7, 1.3))
+    dense, sparse, lacking = (limits[Zone.SURFACE] for limits in (whole, thin, none))
+    assert isinstance(dense, Measurand)
+    assert isinstance(sparse, Measurand)
+    assert sparse.value > 1.3 * dense.value
+    assert isinstance(lacking, NotMeasured)
+    assert "apart in places" in lacking.reason
+
+
+def test_few_points_apart_from_a_dense_surface_are_no_region() -> None:
+    cloud, _centre = thinly_scanned(0.0)
+    sides = blades.SHAPES["service"].surface(np.pi * np.array([0.65, 1.35]), np.full(2, 75.0)).reshape(2, 3)
+    inside = sides.mean(axis=0) + np.random.default_rng(0).uniform(-0.1, 0.1, (6, 3))
+    twin = fit_twin(cloud, np.zeros(len(cloud), np.bool_), in_place(), nominal(), TwinSettings())
+    more = cloud_of(np.concatenate([cloud.points_mm, inside]), NOISE_MM)
+    damages = find_damages(more, np.zeros(len(more), np.bool_), in_place(), nominal(), twin)
+    assert len(damages) == 1
+    assert damages[0].points.max() < len(cloud)
+
+
+def test_what_a_hollow_keeps_of_its_depth_is_its_mean_over_a_disc() -> None:
+    for share in (0.3, 0.9, 1.0, 1.7):
+        r = np.linspace(0.0, share, 20_001)
+        depth = np.where(r < 1.0, 0.5 + 0.5 * np.cos(np.pi * np.minimum(r, 1.0)), 0.0)
+        assert abs(kept(share) - np.trapezoid(depth * 2.0 * r, r) / share**2) < 1e-4

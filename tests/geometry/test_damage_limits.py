@@ -4,8 +4,7 @@ import manifold3d
 import numpy as np
 import pytest
 
-from geometry.damage.damages import HOLLOW_SPACINGS, detection_limit
-from geometry.damage.detection import SHOWN, edge_limit_mm, tip_limit_mm
+from geometry.damage.detection import HOLLOW_SPACINGS, SHOWN, detection_limit, edge_limit_mm, tip_limit_mm
 from geometry.damage.regions import RegionSettings, find_regions, stand_off
 from geometry.types import Measurand, Zone
 from tests.geometry import repair_blades as blades
@@ -74,7 +73,7 @@ def found_at(
 ) -> tuple[dict[Zone, float], dict[Zone, list[bool]], int]:
     """Depths of so many limits, which losses of just that depth are found, and what else is told."""
     whole = blades.specimen({}, noise_mm, np.random.default_rng([seed, 0]), per_mm2)
-    limits = detection_limit(whole.cloud, whole.twin)
+    limits = detection_limit(whole.cloud, whole.alignment, nominal(), whole.twin)
     depth_mm = {zone: shares * limit.value for zone, limit in limits.items() if isinstance(limit, Measurand)}
     length_mm = HOLLOW_SPACINGS / np.sqrt(per_mm2)
     made = losses(depth_mm, length_mm)
