@@ -110,6 +110,13 @@ async def _listen(cell: SimCell, options: argparse.Namespace, stack: AsyncExitSt
     )
 
 
+def _first_port(text: str) -> int:
+    first = int(text)
+    if not 1 <= first <= 65535 - 5:
+        raise argparse.ArgumentTypeError(f"{first} is no port with five more after it")
+    return first
+
+
 def _ports(first: int | None) -> dict[str, int]:
     names = ("turntable", "modbus", "control", "data", "station", "events")
     if first is not None:
@@ -209,7 +216,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--write-config", type=Path, metavar="FILE", help="write a station configuration")
     add("--without", action="append", default=[], choices=["turntable", "scanner", "plc"])
     add("--replay", action="append", default=[], type=Path, metavar="JOB", help="serve recorded frames")
-    add("--ports", type=int, metavar="BASE", help="first of six ports; default: free ones")
+    add("--ports", type=_first_port, metavar="BASE", help="first of six ports; default: free ones")
     add("--parts", type=int, help="how many parts the PLC loads; default: no end")
     add("--plc-log", type=Path, metavar="FILE", help="what the PLC latched, one JSON object a line")
     add("--truth-log", type=Path, metavar="FILE", help="what was loaded, one JSON object a line")

@@ -139,17 +139,23 @@ def show_status(cell: Cell) -> None:
 
 
 async def keep_answers(cell: Cell) -> None:
-    """Enters every acknowledgement into the record before RESULT_VALID falls. Never ends by itself."""
+    """Enters every acknowledgement into the record before RESULT_VALID falls. Never ends by itself.
+
+    A store that failed may have kept the entry all the same: once it is open again, it is asked."""
     while True:
-        await cell.until(lambda: cell.shake.phase is Phase.ACKING)
+        await cell.until(lambda: cell.shake.phase is Phase.ACKING and not cell.record.failed)
         request, code = cell.record.past(cell.shake.sequence), cell.plc.request().ack_code
         assert request is not None
-        try:
-            await cell.on_disk(cell.record.acked, request.record_no, code, utc_now())
-        except RecordFailed as error:
-            cell.fail(error)
-            await cell.until(lambda: cell.shake.phase is not Phase.ACKING)
-            continue
+        if request.phase == "ACKED":
+            code = request.ack_code or 0
+        else:
+            try:
+                await cell.on_disk(cell.record.acked, request.record_no, code, utc_now())
+            except RecordFailed as error:
+                cell.fail(error)
+                if not cell.record.failed:
+                    await cell.until(lambda: cell.shake.phase is not Phase.ACKING)
+                continue
         cell.shake = shaking.acked(cell.shake)
         cell.plc.clear_result()
         show_status(cell)
@@ -186,14 +192,17 @@ def recorded(request: Request) -> PartRecorded:
 
 
 async def take_intents(cell: Cell) -> None:
-    """Enters what people ask for into the record, then does it. Never ends by itself."""
+    """Enters what people ask for into the record, then does it; a stop at once. Never ends by itself."""
     while True:
         intent = await cell.intents.get()
+        if isinstance(intent, Stop):
+            heed(cell, intent)  # waits for no disk
         try:
             await cell.on_disk(cell.record.operator, printable(repr(intent)), utc_now())
         except RecordFailed as error:
             cell.log("error", f"{error}")
-        heed(cell, intent)
+        if not isinstance(intent, Stop):
+            heed(cell, intent)
 
 
 def heed(cell: Cell, intent: Intent) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,8 @@ def inspect_scan(
 ) -> Inspection:
     """The inspection of one scan, once its files are in `folder`.
 
-    Raises `BadPlan`, `BadScan` or `BadRequest`, and then has changed nothing and told no progress.
+    Raises `BadPlan`, `BadScan` or `BadRequest`, and then has changed nothing and told no progress; at the end
+    `BadRequest` where the disk does not take the files, of which it then leaves no parts.
     """
     begun_s = clock()
     check_serial(serial)
@@ -59,7 +61,10 @@ def inspect_scan(
     measurement = replace(measurement, timing_s={**measurement.timing_s, **spent})
     progress("write")
     inputs = inputs_of(recipe, scan, scan_path.name, serial)
-    result = write_inspection(folder, measurement, verdict, recipe.plan, inputs)
+    try:
+        result = write_inspection(folder, measurement, verdict, recipe.plan, inputs)
+    except OSError as error:
+        raise unwritten(folder, error) from error
     return Inspection(verdict=verdict, result=result)
 
 
@@ -71,11 +76,20 @@ def check_serial(serial: str) -> None:
 
 def check_folder(folder: Path) -> None:
     """Raise `BadRequest` unless `folder` is a directory to write into, or can become one."""
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not there.is_dir():
+    try:
+        there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+        is_folder, opened = stat.S_ISDIR(there.stat().st_mode), os.access(there, os.W_OK | os.X_OK)
+        folder.exists()
+    except OSError as error:
+        raise unwritten(folder, error) from error
+    if not is_folder:
         raise BadRequest(f"{folder}: {there} is not a directory")
-    if not os.access(there, os.W_OK | os.X_OK):
+    if not opened:
         raise BadRequest(f"{folder}: {there} cannot be written to")
+
+
+def unwritten(folder: Path, error: OSError) -> BadRequest:
+    return BadRequest(f"{error.filename or folder}: {error.strerror or error}")
 
 
 def inputs_of(recipe: Recipe, scan: Scan, name: str, serial: str) -> Inputs:

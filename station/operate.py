@@ -317,6 +317,7 @@ async def cleared(cell: Cell) -> bool:
     cell.fire(Trigger.RESET)
     try:
         await cell.on_disk(cell.record.reopen)
+        cell.moved.set()  # an acknowledgement may wait for the store
         now, shown = datetime.now(UTC), cell.shake.phase in SHOWN
         await cell.on_disk(close_abandoned, cell.record, "a fault ended the inspection", now, shown=shown)
         await cell.connect()

@@ -161,6 +161,11 @@ class Record:
         self._failed = False
         self._enter(0, self.epoch, "OPERATOR", {"what": "reopened"})
 
+    @property
+    def failed(self) -> bool:
+        """Whether the store failed, so that nothing is written until `reopen`."""
+        return self._failed
+
     def past(self, sequence: int) -> Request | None:
         """What became of an earlier request with this sequence."""
         return self._requests.get(sequence)
@@ -225,12 +230,17 @@ class Record:
         return self._by_record[record_no]
 
     def _load(self) -> None:
-        self._head, self._requests, self._by_record = genesis(), {}, {}
-        starts = 0
+        """Reads everything anew. Until that is done the requests known before stand: the PLC asks on."""
+        head, starts = genesis(), 0
+        requests: dict[int, Request] = {}
         for entry in chain(self._db):
-            self._fold(entry)
+            head = entry
             starts += entry.phase == "STARTED"
+            if entry.phase not in STATION_PHASES:
+                requests[entry.sequence] = fold(requests.get(entry.sequence), entry)
         check_anchor(self.directory, self._db)
+        self._head, self._requests = head, requests
+        self._by_record = {request.record_no: sequence for sequence, request in requests.items()}
         self.epoch = self.epoch or starts % 0xFFFF + 1
 
     def _fold(self, entry: Entry) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,7 +77,10 @@ def replay_job(folder: Path, out: Path | None = None) -> ReplayResult:
         raise BadJob(f"{folder}: {error}") from error
     verdict = judge_again(job.decision, measurement, plan)
     if out is not None:
-        file_part(recipe, measurement, folder / "frames.json", out, verdict, job.ticket)
+        try:
+            file_part(recipe, measurement, folder / "frames.json", out, verdict, job.ticket)
+        except OSError as error:
+            raise BadJob(f"{error.filename or out}: {error.strerror or error}") from error
     return result_of(job, verdict.verdict.value, compared(job, job.decision, measurement, verdict))
 
 
@@ -133,7 +137,7 @@ def read_job(folder: Path) -> RecordedJob:
         decision = Decision.from_body(read_json(folder / "verdict.json")) if decided else None
         measurement = read_json(folder / "measurement.json") if decided else None
         check_files(folder, frames, inputs, digests)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise BadJob(f"{folder}: not a whole job: {error}") from error
     return RecordedJob(
         folder=folder,
@@ -153,8 +157,14 @@ def check_files(
     for role, path in inputs.items():
         if home not in path.resolve().parents or file_sha256(path) != digests[role]:
             raise ValueError(f"{path} is not the {role} that was recorded")
+    if missing := {"plan", "calibration"} - set(inputs):
+        raise ValueError(f"inputs.json: no {' and no '.join(sorted(missing))}")
     for number, frame in enumerate(frames):
-        content = (folder / f"frames/{number:03d}.gdp").read_bytes()
+        if frame.file != f"frames/{number:03d}.gdp" or type(frame.angle_deg) not in (int, float):
+            raise ValueError(f"frames.json: frame {number} is not one of this program")
+        if not math.isfinite(frame.angle_deg):
+            raise ValueError(f"frames.json: the angle of frame {number} is {frame.angle_deg}")
+        content = (folder / frame.file).read_bytes()
         if hashlib.sha256(content).hexdigest() != frame.sha256 or len(content) != frame.bytes:
             raise ValueError(f"{frame.file} is not the frame that was recorded")
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from contextlib import suppress
+from errno import EISDIR
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,18 +94,32 @@ def framed_files(measurement: Measurement, verdict: Verdict, plan: BladePlan) ->
 def replace_files(folder: Path, files: Mapping[str, bytes]) -> None:
     """Puts `files` into `folder`, the last of them last, and removes what else of ours lies there.
 
-    All are on disk under temporary names before the first takes its name."""
+    All are on disk under temporary names before the first takes its name; `OSError` leaves none of these.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    try:
+        put(folder, files)
+    except OSError:
+        for name in files:
+            with suppress(OSError):
+                (folder / f".{name}.part").unlink(missing_ok=True)
+        raise
+    sync(folder)
+
+
+def put(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Writes all beside their names, then renames them."""
     for name, content in files.items():
+        if (folder / name).is_dir():
+            raise IsADirectoryError(EISDIR, os.strerror(EISDIR), str(folder / name))
         write_beside(folder / f".{name}.part", content)
     *others, last = files
     for name in others:
         (folder / f".{name}.part").replace(folder / name)
     for path in folder.iterdir():
-        if OURS.fullmatch(path.name) and path.name not in files:
+        if OURS.fullmatch(path.name) and path.name not in files and not path.is_dir():
             path.unlink()
     (folder / f".{last}.part").replace(folder / last)
-    sync(folder)
 
 
 def write_beside(path: Path, content: bytes) -> None:

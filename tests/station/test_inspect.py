@@ -1,6 +1,8 @@
 """A merged scan of a small analytic blade from files to verdict, and scans that are not enough."""
 
+import errno
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 import trimesh
 
 from geometry.types import Floats
+from station import result
 from station.clouds import BadScan
 from station.formats.write import ply_cloud, stl
 from station.inspect import Inspection, inspect_scan
@@ -163,3 +166,31 @@ def test_what_is_at_fault_writes_nothing(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(BadRequest):
         inspect(folder, "three.xyz", folder / "plan.toml")
     assert not (tmp_path / "out").exists()
+    with pytest.raises(BadRequest, match=r"(?i)name too long"):
+        inspect(folder, "three.xyz", tmp_path / ("n" * 300))
+
+
+def test_a_disk_that_takes_no_more_is_one_line_and_leaves_no_parts(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "result.json").write_text("earlier")
+    written: list[str] = []
+
+    def full(path: Path, content: bytes) -> None:
+        if written:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        written.append(path.name)
+        path.write_bytes(content)
+
+    monkeypatch.setattr(result, "write_beside", full)
+    with pytest.raises(BadRequest, match="No space left"):
+        inspect(folder, "three.xyz", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
+    assert (tmp_path / "result.json").read_text() == "earlier"
+
+
+def test_a_folder_under_the_name_of_a_result_is_one_line(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "result.json").mkdir()
+    with pytest.raises(BadRequest, match=r"result\.json: Is a directory"):
+        inspect(folder, "three.xyz", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["result.json"]

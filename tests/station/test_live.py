@@ -14,10 +14,13 @@ import pytest
 import pytest_asyncio
 
 from drivers.wire.plc import Ctrl, FaultCode, StatusBits, decode_result
+from station import record
 from station.events import (
+    Acknowledge,
     AlarmRaised,
     CloudMeasured,
     PartRecorded,
+    Reset,
     SectionMeasured,
     StationStatus,
     VerdictAcknowledged,
@@ -26,6 +29,7 @@ from station.events import (
 )
 from station.journal import job_folder
 from station.operate import to_its_end
+from station.phases import State
 from station.record import AnotherStation, Request, read_requests, verify
 
 if TYPE_CHECKING:
@@ -255,6 +259,72 @@ async def test_the_loop_never_waits(rig: "Rig") -> None:
     await rig.plc.until_bits(READY)
     measuring.cancel()
     assert sorted(lags)[int(0.95 * len(lags))] < 0.1
+
+
+async def test_an_answer_that_the_store_refused_is_entered_after_the_reset(
+    station: Stations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with station(tmp_path) as rig:
+        await delivered(rig)
+        fail_once(monkeypatch, "ACKED")
+        await rig.plc.write(ctrl=UP | Ctrl.RESULT_ACK, ack_sequence=1, ack_code=1)
+        await rig.plc.until_bits(VALID | FAULT)
+        operator_resets(rig)
+        await rig.plc.until_bits(StatusBits(0), VALID | FAULT)
+        await rig.plc.write(ctrl=UP)
+        await rig.plc.until_bits(READY)
+        assert (rig.cell.record.request(1).phase, rig.cell.record.request(1).ack_code) == ("ACKED", 1)
+    assert verify(tmp_path / "record") == ()
+
+
+async def test_an_answer_while_the_record_is_read_anew_waits_for_it(
+    station: Stations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_chain = record.chain
+
+    def slowly(db: Any) -> Iterator[Any]:
+        time.sleep(1.0)
+        yield from read_chain(db)
+
+    async with station(tmp_path) as rig:
+        fail_once(monkeypatch, "PUBLISHED")
+        await rig.plc.until_bits(READY)
+        await rig.plc.ask(1)
+        await rig.plc.until_bits(VALID | FAULT)
+        await rig.cell.until(lambda: rig.cell.state is State.ABORTED)
+        monkeypatch.setattr(record, "chain", slowly)
+        operator_resets(rig)
+        await rig.cell.until(lambda: rig.cell.state is State.RESETTING)
+        await asyncio.sleep(0.3)
+        await rig.plc.write(ctrl=UP | Ctrl.RESULT_ACK, ack_sequence=1, ack_code=1)
+        await rig.plc.until_bits(StatusBits(0), VALID | FAULT)
+        assert not rig.running.done()
+        assert rig.cell.record.request(1).phase == "ACKED"
+
+
+async def delivered(rig: "Rig") -> None:
+    await rig.plc.until_bits(READY)
+    await rig.plc.ask(1)
+    await rig.plc.until_bits(VALID, BUSY)
+    await rig.cell.until(lambda: rig.cell.record.request(1).phase == "PUBLISHED")
+
+
+def fail_once(patch: pytest.MonkeyPatch, phase: str) -> None:
+    """The disk is full when the next entry of this phase was just committed."""
+    write_anchor = record.write_anchor
+
+    def full(directory: Path, entry: Any) -> None:
+        if entry.phase == phase:
+            patch.setattr(record, "write_anchor", write_anchor)
+            raise OSError(28, "No space left on device")
+        write_anchor(directory, entry)
+
+    patch.setattr(record, "write_anchor", full)
+
+
+def operator_resets(rig: "Rig") -> None:
+    rig.cell.intents.put_nowait(Acknowledge())
+    rig.cell.intents.put_nowait(Reset())
 
 
 async def test_a_second_station_finds_the_record_held(rig: "Rig", station: Stations) -> None:

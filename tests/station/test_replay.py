@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -154,6 +155,12 @@ def test_the_gates_are_those_of_the_record(job: Path, measured: dict[str, Any]) 
     assert replay_job(job).again == "HOLD"
 
 
+def test_a_place_that_takes_no_files_is_one_line(job: Path, measured: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadJob, match="file"):
+        replay_job(job, tmp_path / "file")
+
+
 def test_an_interrupted_job_is_the_hold_that_it_was(recorded: Path) -> None:
     result = replay_job(recorded / "000002")
     assert (result.recorded, result.again, result.as_recorded) == ("HOLD", "HOLD", True)
@@ -177,9 +184,36 @@ def lead_out(job: Path) -> None:
     (job / "inputs.json").write_text(json.dumps(inputs))
 
 
+def lead_frame_out(job: Path) -> None:
+    frames = json.loads((job / "frames.json").read_text())
+    frames[0]["file"] = "../000002/frames/000.gdp"
+    (job / "frames.json").write_text(json.dumps(frames))
+
+
+def spoil_angle(angle: str) -> Callable[[Path], None]:
+    def spoil(job: Path) -> None:
+        rows = json.loads((job / "frames.json").read_text())
+        rows[1]["angle_deg"] = json.loads(angle)
+        (job / "frames.json").write_text(json.dumps(rows))
+
+    return spoil
+
+
+def forget_plan(job: Path) -> None:
+    inputs = json.loads((job / "inputs.json").read_text())
+    del inputs["plan"]
+    (job / "inputs.json").write_text(json.dumps(inputs))
+
+
 @pytest.mark.parametrize(
     "spoil",
     [
+        lead_frame_out,
+        spoil_angle('"30"'),
+        spoil_angle("null"),
+        spoil_angle("NaN"),
+        forget_plan,
+        lambda job: (job / "measurement.json").write_text("[" * 100_000),
         spoil_frame,
         spoil_plan,
         lead_out,
