@@ -283,7 +283,7 @@ async def test_an_answer_while_the_record_is_read_anew_waits_for_it(
     read_chain = record.chain
 
     def slowly(db: Any) -> Iterator[Any]:
-        time.sleep(1.0)
+        time.sleep(2.5)
         yield from read_chain(db)
 
     async with station(tmp_path) as rig:
@@ -294,8 +294,8 @@ async def test_an_answer_while_the_record_is_read_anew_waits_for_it(
         await rig.cell.until(lambda: rig.cell.state is State.ABORTED)
         monkeypatch.setattr(record, "chain", slowly)
         operator_resets(rig)
-        await rig.cell.until(lambda: rig.cell.state is State.RESETTING)
-        await asyncio.sleep(0.3)
+        await asyncio.sleep(0.5)
+        assert rig.cell.record.failed
         await rig.plc.write(ctrl=UP | Ctrl.RESULT_ACK, ack_sequence=1, ack_code=1)
         await rig.plc.until_bits(StatusBits(0), VALID | FAULT)
         assert not rig.running.done()
