@@ -26,6 +26,9 @@ from geometry.types import Bools, Cloud, Floats, Ints
 
 TRIAL_POINTS = 1500  # of the scan, to choose among the signs of the principal axes
 TRIAL_STEPS = 30
+SPAN_ROUNDS = 30  # of the fit and the span that it shows to be seen
+SPAN_CLOSE_MM = 0.003
+CLUTTER = 1e-3  # of the scan may lie lower than the blade that it shows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,22 +57,44 @@ def register_thesis(
     """The pose of the scan on the nominal, by the thesis' three steps.
 
     Principal axes (of the four proper choices of sign, the one that a short ICP brings nearest), then
-    point-to-point ICP, then the fine-tuned alignment, each until the error settles. Pairs of points hold the
-    pose along the surface by their spacing alone, so it may slide where the shape does not say; what the
-    kept points tell is in `information` and `weak_directions`.
+    point-to-point ICP, then the fine-tuned alignment, each until the error settles. The nominal takes part
+    down to where the scan ends: what a fixture hides would draw the scan along the span. Pairs of points
+    hold the pose along the surface by their spacing alone, so it may slide where the shape does not say;
+    what the kept points tell is in `information` and `weak_directions`.
     Raises `CannotRegister` for a cloud too small or without shape. Source: thesis 3.3.
     """
     if len(cloud) < settings.least_points:
         raise CannotRegister(f"{len(cloud)} scan points are fewer than {settings.least_points}")
     cloud = _thinned(cloud, settings.points)
-    scan, cad = _scan_points(cloud.points_mm), _cad_points(nominal, cloud.points_mm)
+    scan, whole = _scan_points(cloud.points_mm), _cad_points(nominal, cloud.points_mm)
+    cad, icp, runner_up_ratio = _over_seen_span(scan, whole, nominal.z_min_mm, settings)
     tree = cKDTree(cad.points_mm)
-    T_start, runner_up_ratio = _from_principal_axes(scan.points_mm, cad.points_mm, tree)
-    icp = _match(scan, cad, tree, T_start, _all, settings.close_mm, settings.icp_steps)
     tuned = _match(scan, cad, tree, icp.T_nominal_scan, _alike, settings.close_mm, settings.tuned_steps)
     if tuned.kept.sum() < settings.least_points:
         raise CannotRegister(f"{int(tuned.kept.sum())} scan points resemble the nominal")
     return _alignment(cloud, nominal, tuned, icp, runner_up_ratio, settings)
+
+
+def _over_seen_span(
+    scan: "_Described", whole: "_Described", z_min_mm: float, settings: ThesisRegisterSettings
+) -> tuple["_Described", "_Matched", float]:
+    """The nominal's points down to where the scan ends, the scan's pose on them after ICP, and the runner-up
+    ratio of its principal axes. Where it ends follows from the pose, so both are found in turns."""
+    low_mm, cad = z_min_mm, whole.above(z_min_mm)
+    tree = cKDTree(cad.points_mm)
+    T_start, runner_up_ratio = _from_principal_axes(scan.points_mm, cad.points_mm, tree)
+    hidden_mm = z_min_mm - float(whole.points_mm[:, 2].min())
+    if _height_mm(T_start, scan.points_mm) > float(np.ptp(whole.points_mm[:, 2])) - 0.5 * hidden_mm:
+        cad, tree = whole, cKDTree(whole.points_mm)  # nothing is hidden
+    icp = _match(scan, cad, tree, T_start, _all, settings.close_mm, settings.icp_steps)
+    for _ in range(SPAN_ROUNDS if cad is not whole else 0):
+        before_mm, low_mm = low_mm, _lowest_mm(icp.T_nominal_scan, scan.points_mm)
+        if abs(low_mm - before_mm) < SPAN_CLOSE_MM:
+            break
+        cad = whole.above(low_mm)
+        tree = cKDTree(cad.points_mm)
+        icp = _match(scan, cad, tree, icp.T_nominal_scan, _all, settings.close_mm, settings.icp_steps)
+    return cad, icp, runner_up_ratio
 
 
 def mask_thesis(cloud: Cloud, alignment: Alignment, nominal: Nominal) -> Bools:
@@ -93,6 +118,29 @@ class _Described:
     points_mm: Floats  # (n, 3)
     neighbours: Ints  # (n, k; -1 none)
     gaussian_per_mm2: Floats  # (n,)
+
+    def above(self, z_mm: float) -> "_Described":
+        """Those of the points at z_mm or above, and their neighbours that are."""
+        kept = self.points_mm[:, 2] >= z_mm
+        if kept.all():
+            return self
+        place = np.where(kept, np.cumsum(kept) - 1, -1)
+        there = self.neighbours[kept]
+        return _Described(
+            points_mm=self.points_mm[kept],
+            neighbours=np.where(there >= 0, place[there], -1),
+            gaussian_per_mm2=self.gaussian_per_mm2[kept],
+        )
+
+
+def _lowest_mm(T_nominal_scan: Floats, scan_mm: Floats) -> float:
+    """Where along the span the scan ends."""
+    return float(np.quantile(apply(T_nominal_scan, scan_mm)[:, 2], CLUTTER))
+
+
+def _height_mm(T_nominal_scan: Floats, scan_mm: Floats) -> float:
+    low_mm, high_mm = np.quantile(apply(T_nominal_scan, scan_mm)[:, 2], [CLUTTER, 1.0 - CLUTTER])
+    return float(high_mm - low_mm)
 
 
 def _scan_points(points_mm: Floats) -> _Described:

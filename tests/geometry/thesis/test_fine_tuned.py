@@ -185,6 +185,26 @@ def test_too_few_points_and_points_on_a_line_are_refused():
         register_thesis(flat, nominal(), FEW)
 
 
+@pytest.mark.parametrize(("hidden_mm", "most_mm"), [(0.0, 0.2), (7.0, 0.5)])
+def test_what_a_fixture_hides_does_not_draw_the_scan_along_the_span(hidden_mm, most_mm):
+    """Pairs of points alone hold this blade along its span: with the whole nominal it slid by 2.8."""
+    held = prepare_nominal(
+        blades.mesh(BLADE), NominalSettings(z_min_mm=8.0, z_max_mm=BLADE.height_mm, sample_mm=0.7)
+    )
+    rng = np.random.default_rng(6)
+    scan = blades.with_noise(blades.scan(BLADE, 4.0, rng), SIGMA_MM, rng)
+    points_mm = scan.points_mm[scan.points_mm[:, 2] > hidden_mm]
+    T_nominal_scan = pose(6)
+    cloud = Cloud(
+        points_mm=apply(inverse(T_nominal_scan), points_mm),
+        sigma_mm=np.full(len(points_mm), SIGMA_MM),
+        view=np.zeros(len(points_mm), np.int64),
+    )
+    found = register_thesis(cloud, held, FEW)
+    moved_mm = apply(found.T_nominal_scan, cloud.points_mm) - points_mm
+    assert np.abs(moved_mm[:, 2]).max() < most_mm
+
+
 @pytest.mark.parametrize("wrong", [{"points": 10}, {"close_mm": 0.0}, {"icp_steps": 0}])
 def test_settings_that_contradict_themselves_are_refused(wrong):
     with pytest.raises(BadInput):
