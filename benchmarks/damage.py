@@ -59,7 +59,7 @@ def hollows(limits: float, spacings: float, pitch_mm: float, noise_mm: float, se
         cloud = cloud_of(scan.points, noise_mm)
         twin = fit_twin(cloud, scan.label > 0, in_place(), nominal(), TwinSettings())
         if not seed:
-            limit = detection_limit(cloud, in_place(), nominal(), twin)[Zone.SURFACE]
+            limit = detection_limit(cloud, in_place(), nominal(), twin).depth_mm[Zone.SURFACE]
             assert isinstance(limit, Measurand)
             depth_mm = limits * limit.value
             continue

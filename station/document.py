@@ -64,7 +64,10 @@ def document(measurement: Measurement, verdict: Verdict, plan: BladePlan, inputs
         "form": values_of({"deviation_mm": measurement.form_mm}),
         "zones": [zone_of(zone) for zone in measurement.zones],
         "damages": [damage_of(damage) for damage in measurement.damages or ()],
-        "detection": values_of({zone.value: limit for zone, limit in measurement.detection_mm.items()}),
+        "detection": values_of(
+            {zone.value: limit for zone, limit in measurement.detection_mm.items()}
+            | {"area_mm2": measurement.detection_mm2}
+        ),
         "repair": repair_of(measurement, verdict),
         "findings": [finding_of(finding) for finding in verdict.findings],
         "not_measured": dict(measurement.failures),

@@ -120,7 +120,8 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
         form_mm=twin.form_mm if twin else NO_TWIN,
         residual_mm=twin.noise_mm if twin else None,
         damages=None if damages is None else with_volumes(damages, repairs),
-        detection_mm=detection or {},
+        detection_mm=detection.depth_mm if detection else found.detection_mm,
+        detection_mm2=detection.area_mm2 if detection else found.detection_mm2,
         repairs=repairs,
         zones=zones or (),
     )

@@ -43,7 +43,8 @@ class Measurement:
     `service` is how the airfoil stands against its root, where the plan names a datum zone.
     `aligned_mm` (n, 3) is the cleaned scan in the nominal frame, `deviation_mm` (n,) its signed distance
     to the nominal, positive outside. `detection_mm` is the depth of damage that is surely found in a
-    zone. `residual_mm` is what the twin leaves of the sound points: noise, without the form of the part.
+    zone, where it covers `detection_mm2`. `residual_mm` is what the twin leaves of the sound points: noise,
+    without the form of the part.
     `timing_s` counts the seconds of each step.
     """
 
@@ -61,6 +62,7 @@ class Measurement:
     residual_mm: float | None = None
     damages: tuple[Damage, ...] | None = None
     detection_mm: Mapping[Zone, Measured] = field(default_factory=dict)
+    detection_mm2: Measured = NO_TWIN
     repairs: RepairVolume | None = None
     zones: tuple[ZoneCoverage, ...] = ()
     failures: Mapping[str, str] = field(default_factory=dict)

@@ -1,6 +1,7 @@
 """The least damage of each zone that a scan shows."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,14 +24,22 @@ TIP = 0.98  # and the tip
 SHOWN = 0.8  # of the mean depth of a strip: few points fall on it, and by chance (simulated, for 95 %)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectionLimits:
+    """The least damage that is surely found: so deep in each zone, and so large."""
+
+    depth_mm: Mapping[Zone, Measured]
+    area_mm2: Measured
+
+
 def detection_limit(
     cloud: Cloud,
     alignment: Alignment,
     nominal: Nominal,
     twin: Twin,
     settings: RegionSettings = RegionSettings(),
-) -> dict[Zone, Measured]:
-    """The depth (mm) per zone that is found with 95 % probability at the noise and density of this scan.
+) -> DetectionLimits:
+    """The depth per zone, and the area, that are found with 95 % probability at this noise and density.
 
     Stated for a hollow that runs out smoothly over `HOLLOW_SPACINGS` of the usual spacings; a narrower one
     must be deeper. It is found when the mean over a neighbourhood, which flattens it, passes `high` sigmas;
@@ -39,7 +48,8 @@ def detection_limit(
     theirs is stated for the usual spacing, and not at all where a place is too thin for any hollow.
     """
     if not twin.supported.any():
-        return {zone: NotMeasured(reason="no part of the twin is seen") for zone in PRECEDENCE}
+        unseen = NotMeasured(reason="no part of the twin is seen")
+        return DetectionLimits(depth_mm=dict.fromkeys(PRECEDENCE, unseen), area_mm2=unseen)
     mean_mm = max(noise_of(cloud, twin) / np.sqrt(settings.neighbours + 1), settings.floor_mm)
     sigma_mm = float(np.hypot(mean_mm, np.quantile(twin.sigma_mm[twin.supported], 0.95)))
     mean_limit_mm = (settings.high + PROBABLE) * sigma_mm
@@ -58,7 +68,8 @@ def detection_limit(
             found[zone] = NotMeasured(reason=f"points lie {thinnest_mm:.2f} mm apart in places")
         else:
             found[zone] = _limit(zone, _limit_mm(zone, hollow_mm, across_mm, width_mm, twin))
-    return found
+    area_mm2 = Measurand(name="area_detection", value=0.25 * np.pi * width_mm**2, sigma=0.0, unit="mm2")
+    return DetectionLimits(depth_mm=found, area_mm2=area_mm2)
 
 
 def _thinnest_mm(

@@ -25,7 +25,7 @@ def found() -> tuple[tuple[Damage, ...], Bools, dict[Zone, object]]:
     cloud, mask = cloud_of(scan.points, NOISE_MM), scan.label > 0
     twin = fit_twin(cloud, mask, in_place(), nominal(), TwinSettings())
     damages = find_damages(cloud, mask, in_place(), nominal(), twin)
-    return damages, mask, detection_limit(cloud, in_place(), nominal(), twin)
+    return damages, mask, detection_limit(cloud, in_place(), nominal(), twin).depth_mm
 
 
 def test_the_broken_corner_and_the_pit_are_found_in_their_zones_and_nothing_else() -> None:

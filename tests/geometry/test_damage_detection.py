@@ -1,5 +1,6 @@
 """Shallow hollows of known depth beside deep damage: which are found, and which points lie on them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -51,7 +52,7 @@ def scanned(depth_mm: float, width_mm: float, seed: int) -> Case:
     deep = blades.hollow_depth(scan.points, centres, depth_mm, width_mm)
     broken = scan.points[scan.label > 0]
     deep[scan.label > 0] = np.minimum(-truth.distance(broken), blades.SPAN_MM - broken[:, 2])
-    limit = detection_limit(cloud, in_place(), nominal(), twin)[Zone.SURFACE]
+    limit = detection_limit(cloud, in_place(), nominal(), twin).depth_mm[Zone.SURFACE]
     assert isinstance(limit, Measurand)
     return Case(damages, centres, told, deep, limit)
 
@@ -111,11 +112,11 @@ def thinly_scanned(spacing_mm: float) -> tuple[Cloud, Floats]:
     return cloud_of(np.delete(scan.points, near[~kept_points], axis=0), NOISE_MM), centre
 
 
-def found_thinly(spacing_mm: float) -> tuple[tuple[Damage, ...], Floats, dict[Zone, Measured]]:
+def found_thinly(spacing_mm: float) -> tuple[tuple[Damage, ...], Floats, Mapping[Zone, Measured]]:
     cloud, centre = thinly_scanned(spacing_mm)
     nothing = np.zeros(len(cloud), np.bool_)
     twin = fit_twin(cloud, nothing, in_place(), nominal(), TwinSettings())
-    limits = detection_limit(cloud, in_place(), nominal(), twin)
+    limits = detection_limit(cloud, in_place(), nominal(), twin).depth_mm
     return find_damages(cloud, nothing, in_place(), nominal(), twin), centre, limits
 
 
@@ -134,6 +135,14 @@ def test_the_limit_of_a_side_is_that_of_its_thinnest_place() -> None:
     assert sparse.value > 1.3 * dense.value
     assert isinstance(lacking, NotMeasured)
     assert "apart in places" in lacking.reason
+
+
+def test_the_area_is_that_of_the_hollow_that_the_depth_is_stated_for() -> None:
+    cloud, _ = thinly_scanned(0.7)
+    twin = fit_twin(cloud, np.zeros(len(cloud), np.bool_), in_place(), nominal(), TwinSettings())
+    area = detection_limit(cloud, in_place(), nominal(), twin).area_mm2
+    assert isinstance(area, Measurand)
+    assert abs(area.value - 0.25 * np.pi * (HOLLOW_SPACINGS * PITCH_MM) ** 2) < 0.15 * area.value
 
 
 def test_few_points_apart_from_a_dense_surface_are_no_region() -> None:

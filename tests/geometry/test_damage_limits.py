@@ -73,7 +73,7 @@ def found_at(
 ) -> tuple[dict[Zone, float], dict[Zone, list[bool]], int]:
     """Depths of so many limits, which losses of just that depth are found, and what else is told."""
     whole = blades.specimen({}, noise_mm, np.random.default_rng([seed, 0]), per_mm2)
-    limits = detection_limit(whole.cloud, whole.alignment, nominal(), whole.twin)
+    limits = detection_limit(whole.cloud, whole.alignment, nominal(), whole.twin).depth_mm
     depth_mm = {zone: shares * limit.value for zone, limit in limits.items() if isinstance(limit, Measurand)}
     length_mm = HOLLOW_SPACINGS / np.sqrt(per_mm2)
     made = losses(depth_mm, length_mm)

@@ -190,6 +190,7 @@ def measurement(**changed: Any) -> Measurement:
         "residual_mm": 0.012,
         "damages": (),
         "detection_mm": {zone: number("depth_mm", 0.06, 0.01) for zone in ZONES},
+        "detection_mm2": number("area_mm2", 3.0, 0.0),
         "repairs": repairs(),
         "zones": tuple(coverage(zone) for zone in ZONES),
         "timing_s": {"clean": 0.5, "register": 1.0},

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from geometry.damage.damages import DamageKind
+from geometry.damage.detection import DetectionLimits
 from geometry.errors import CannotMeasure
 from geometry.scan.calibrate import AxisCalibration
 from geometry.scan.overlap import Overlap, RefinedAxis
@@ -78,7 +79,9 @@ def geometry(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "mask_damage": np.zeros(4, bool),
         "make_twin": twin,
         "find_damages": (),
-        "detection_limit": measurement().detection_mm,
+        "detection_limit": DetectionLimits(
+            depth_mm=measurement().detection_mm, area_mm2=measurement().detection_mm2
+        ),
         "find_repairs": repairs(),
         "cut_sections": (section(),),
         "blade_line": None,

@@ -428,3 +428,16 @@ def test_a_section_of_which_nothing_was_measured_has_no_plot() -> None:
 
 def test_a_borderline_form_is_drawn() -> None:
     report(measurement(form_mm=number("form_mm", 0.9)))
+
+
+def test_the_area_from_which_damage_is_found_is_stated_or_its_lack_is() -> None:
+    given = measurement()
+    verdict = judge(given, plan(), GATES)
+    result = document(given, verdict, plan(), INPUTS)
+    assert result["detection"]["area_mm2"] == {"value": 3.0, "sigma": 0.0, "unit": "mm2"}
+    assert "covers 3.0 mm² or more" in render(result, given, verdict, plan())
+    blind = measurement(detection_mm2=lost("no twin"))
+    result = document(blind, verdict, plan(), INPUTS)
+    assert result["detection"]["area_mm2"] is None
+    assert result["detection"]["not_measured"] == {"area_mm2": "no twin"}
+    assert "mm² or more" not in render(result, blind, verdict, plan())
