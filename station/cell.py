@@ -25,6 +25,7 @@ from station import alarms as engine
 from station import phases
 from station.acquire import ScanPlan
 from station.alarms import Alarms
+from station.chain import RecordFailed
 from station.config import Calibration, StationConfig, read_calibration
 from station.events import (
     AlarmCleared,
@@ -50,6 +51,8 @@ T = TypeVar("T")
 CONNECT_S = 20.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 2.0
 STOP_S = 2.0
+DISK_S = 15.0  # for one step of a part: a request that is broken off meanwhile is over within 20 s
+REOPEN_S = 120.0
 WARM_S = 600.0
 MAX_INTENTS = 64
 
@@ -99,8 +102,27 @@ class Cell:
     reset_by: Literal["plc", "operator"] | None = None
 
     async def on_disk(self, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """The result of `call` on the one disk thread: in order, and never in the loop."""
-        return await asyncio.get_running_loop().run_in_executor(self.disk, partial(call, *args, **kwargs))
+        """The result of `call` on the one disk thread: in order, and never in the loop.
+
+        Raises `RecordFailed` when the disk is not done after DISK_S. What it writes may still come to its
+        end, so the record takes nothing more until it is opened again."""
+        return await self._within(DISK_S, partial(call, *args, **kwargs))
+
+    async def reopen_record(self) -> None:
+        """Opens the record again after it failed; a long one is read for as long as REOPEN_S."""
+        await self._within(REOPEN_S, self.record.reopen)
+
+    async def _within(self, timeout_s: float, call: Callable[[], T]) -> T:
+        done = asyncio.get_running_loop().run_in_executor(self.disk, call)
+        try:
+            async with asyncio.timeout(timeout_s) as limit:
+                return await done
+        except TimeoutError as error:
+            if not limit.expired():
+                raise
+            self.record.distrust()
+            late = f"the disk is not done after {timeout_s:g} s"
+            raise RecordFailed(f"{self.record.directory}: {late}") from error
 
     async def until(self, holds: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Whether `holds` came true; it is looked at whenever something has changed."""

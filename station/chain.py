@@ -189,12 +189,16 @@ def check_anchor(directory: Path, db: sqlite3.Connection) -> None:
         anchor = json.loads((directory / ANCHOR).read_bytes())
     except FileNotFoundError:
         anchor = None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise RecordBroken(f"{directory / ANCHOR} is not readable") from None
     if anchor is None:
         if read(db, 2) is not None:
             raise RecordBroken(f"{directory / ANCHOR} is missing")
         return
-    entry = read(db, anchor["entry_no"])
-    if entry is None or entry.hash != anchor["hash"]:
-        raise RecordBroken(f"the record ends before entry {anchor['entry_no']}, which its anchor names")
+    match anchor:
+        case {"entry_no": int(entry_no), "hash": str(digest)}:
+            entry = read(db, entry_no)
+        case _:
+            raise RecordBroken(f"{directory / ANCHOR} names no entry")
+    if entry is None or entry.hash != digest:
+        raise RecordBroken(f"the record ends before entry {entry_no}, which its anchor names")

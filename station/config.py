@@ -8,7 +8,18 @@ from typing import Annotated, Literal, Self
 from platformdirs import user_config_path
 from pydantic import AwareDatetime, Field, PrivateAttr, StringConstraints, model_validator
 
-from station.tomlfile import BadFile, NonNegative, Port, Positive, Row, Settings, Text, read_settings
+from station.tomlfile import (
+    BadFile,
+    Flag,
+    NonNegative,
+    Port,
+    Positive,
+    Row,
+    Settings,
+    Text,
+    Whole,
+    read_settings,
+)
 
 Mode = Literal["PRODUCTION", "STUDY", "MAINTENANCE", "SIMULATION"]
 RecipeNumber = Annotated[str, StringConstraints(pattern=r"^[1-9][0-9]{0,4}$")]
@@ -22,8 +33,8 @@ class BadConfig(BadFile):
 
 class Turntable(Settings):
     port: Text
-    baud: Annotated[int, Field(gt=0)] = 115200
-    address: Annotated[int, Field(ge=1, le=99)] = 1
+    baud: Annotated[Whole, Field(gt=0)] = 115200
+    address: Annotated[Whole, Field(ge=1, le=99)] = 1
     reply_timeout_s: Positive = 0.5
     settle_s: NonNegative = 0.05
     position_tolerance_deg: Positive = 0.01
@@ -34,7 +45,7 @@ class Scanner(Settings):
     modbus_port: Port = 502
     control_port: Port = 3190
     data_port: Port = 3196
-    serial: Annotated[int, Field(ge=0)]
+    serial: Whole
     capture_timeout_s: Positive = 30.0
 
 
@@ -42,7 +53,7 @@ class Plc(Settings):
     listen_host: Text
     port: Port = 502
     heartbeat_timeout_s: Positive = 2.0
-    accept_crc_zero: bool = True
+    accept_crc_zero: Flag = True
 
 
 class Record(Settings):
@@ -155,7 +166,7 @@ class Calibration(Settings):
     T_scanner_table0: tuple[Row, Row, Row, Row]
     sigma_axis_offset_mm: NonNegative
     sigma_axis_tilt_deg: NonNegative
-    scanner_serial: int
+    scanner_serial: Whole
 
     def age_days(self, now: datetime) -> float:
         """Days since the calibration; negative when it lies in the future."""

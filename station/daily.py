@@ -7,7 +7,7 @@ from pydantic import AwareDatetime, Field
 
 from station.config import BadConfig, StationConfig
 from station.gates import Gate
-from station.tomlfile import NonNegative, Number, Settings, read_settings
+from station.tomlfile import NonNegative, Number, Settings, Whole, read_settings
 
 
 class DailyCheck(Settings):
@@ -15,7 +15,7 @@ class DailyCheck(Settings):
 
     schema_: Annotated[Literal["bladecell.daily_check/1"], Field(alias="schema")]
     created_utc: AwareDatetime
-    scanner_serial: int
+    scanner_serial: Whole
     stray_mm: NonNegative  # largest distance of a ball from its mean place on the table
     length_error_mm: Number  # distance of the two balls less the certified one
 

@@ -82,12 +82,27 @@ async def operate(cell: Cell) -> None:
 
 async def serve(cell: Cell) -> None:
     """From STOPPED to ready, then request after request."""
-    await cell.until(lambda: cell.wanted and cell.plc.request().has(Ctrl.ENABLE) | (not cell.headless))
+    await called(cell)
     cell.fire(Trigger.START)
     await get_ready(cell)
     cell.fire(Trigger.READY)
     while True:
         await serve_next(cell)
+
+
+async def called(cell: Cell) -> None:
+    """Returns when the station is wanted, by an operator or, headless, by the PLC's ENABLE too."""
+
+    def enabled() -> bool:
+        return not cell.headless or cell.plc.request().has(Ctrl.ENABLE)
+
+    while not (cell.wanted and enabled()):
+        if not cell.wanted:
+            cell.tell_state("waits for START")
+            await cell.until(lambda: cell.wanted)
+        else:
+            cell.tell_state("waits for ENABLE of the PLC")
+            await cell.until(lambda: enabled() or not cell.wanted)
 
 
 async def get_ready(cell: Cell) -> None:
@@ -316,7 +331,7 @@ async def cleared(cell: Cell) -> bool:
         return False
     cell.fire(Trigger.RESET)
     try:
-        await cell.on_disk(cell.record.reopen)
+        await cell.reopen_record()
         cell.moved.set()  # an acknowledgement may wait for the store
         now, shown = datetime.now(UTC), cell.shake.phase in SHOWN
         await cell.on_disk(close_abandoned, cell.record, "a fault ended the inspection", now, shown=shown)

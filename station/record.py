@@ -161,6 +161,10 @@ class Record:
         self._failed = False
         self._enter(0, self.epoch, "OPERATOR", {"what": "reopened"})
 
+    def distrust(self) -> None:
+        """Has nothing more written until `reopen`: somebody could not wait for the end of a write."""
+        self._failed = True
+
     @property
     def failed(self) -> bool:
         """Whether the store failed, so that nothing is written until `reopen`."""

@@ -24,7 +24,9 @@ Positive = Annotated[Number, Field(gt=0.0)]
 NonNegative = Annotated[Number, Field(ge=0.0)]
 Row = tuple[Number, Number, Number, Number]  # of a 4x4 motion
 Text = Annotated[str, Strict(), Field(min_length=1, max_length=200), AfterValidator(printable)]
-Port = Annotated[int, Strict(), Field(ge=1, le=65535)]
+Whole = Annotated[int, Strict(), Field(ge=0)]
+Port = Annotated[Whole, Field(ge=1, le=65535)]
+Flag = Annotated[bool, Strict()]
 
 
 class BadFile(Refusal):

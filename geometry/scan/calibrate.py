@@ -9,6 +9,7 @@ from geometry.errors import BadInput, CannotMeasure
 from geometry.transforms import about_z, apply, check_rigid, inverse, rigid
 from geometry.types import Floats, Ints
 
+MIN_ANGLES = 5  # two more than a circle has unknowns, so that its scatter is known
 MIN_TURN_DEG = 90.0  # of arc that the sphere must see for its circle to be known
 MIN_CHECK_DEG = 180.0  # of arc round which a ball must be seen for its place to prove the axis
 
@@ -49,8 +50,10 @@ def calibrate_axis(sphere_centres_mm: Floats, angles_deg: Floats) -> AxisCalibra
     angles spread over a quarter turn show a circle that is clear of its own scatter.
     """
     angles_rad = np.deg2rad(angles_deg)
-    if len(angles_rad) < 5 or not _spread_deg(angles_deg) >= MIN_TURN_DEG:
-        raise CannotMeasure(f"axis: {len(angles_rad)} angles do not show a turn of {MIN_TURN_DEG:g} deg")
+    if len(angles_rad) < MIN_ANGLES:
+        raise CannotMeasure(f"axis: {len(angles_rad)} angles, {MIN_ANGLES} are needed")
+    if not _spread_deg(angles_deg) >= MIN_TURN_DEG:
+        raise CannotMeasure(f"axis: the angles do not show a turn of {MIN_TURN_DEG:g} deg")
     design = np.column_stack([np.ones(len(angles_rad)), np.cos(angles_rad), np.sin(angles_rad)])
     (p_mm, a_mm, b_mm), *_ = np.linalg.lstsq(design, sphere_centres_mm, rcond=None)
     sigma_mm = _scatter_mm(sphere_centres_mm - design @ np.stack([p_mm, a_mm, b_mm]))

@@ -1,5 +1,7 @@
 """XYZ, ASC and CSV text: one point a line, x y z first or under these names."""
 
+import re
+
 from geometry.types import Floats
 from station.formats.malformed import Malformed, numbers
 
@@ -40,8 +42,16 @@ def is_number(word: str) -> bool:
 
 
 def named_columns(titles: list[str]) -> list[int]:
-    """The columns whose titles begin with x, y and z."""
-    initials = [title[:1].lower() for title in titles]
-    if not all(axis in initials for axis in "xyz"):
+    """The columns that are called x, y and z, alone or with a unit: x_mm, X [mm]."""
+    return [named_column([title.lower() for title in titles], axis) for axis in "xyz"]
+
+
+def named_column(titles: list[str], axis: str) -> int:
+    """The one column of an axis; raises `Malformed` where there is none, or more than one."""
+    plain = [i for i, title in enumerate(titles) if title == axis]
+    named = plain or [i for i, title in enumerate(titles) if re.match(rf"{axis}(?![a-z])", title)]
+    if not named:
         raise Malformed("the first row is neither numbers nor the names x, y, z")
-    return [initials.index(axis) for axis in "xyz"]
+    if len(named) > 1:
+        raise Malformed(f"columns {' and '.join(str(i + 1) for i in named)} are both called {axis}")
+    return named[0]

@@ -52,7 +52,12 @@ def test_uncertainties_are_the_scatter_over_many_trials():
     assert np.mean([f.sigma_tilt_deg for f in trials]) == pytest.approx(tilt_sd, rel=0.15)
 
 
-@pytest.mark.parametrize("angles", [[0, 10, 20, 30, 40, 50], [0, 90, 180, 270], [0, 0, 0, 0, 0, 0]])
+def test_a_circle_wants_five_angles():
+    with pytest.raises(CannotMeasure, match="4 angles, 5 are needed"):
+        calibrate_axis(centres([0, 90, 180, 270], 0.01, np.random.default_rng(2)), np.arange(4) * 90.0)
+
+
+@pytest.mark.parametrize("angles", [[0, 10, 20, 30, 40, 50], [0, 0, 0, 0, 0, 0]])
 def test_too_little_turn_is_no_calibration(angles):
     with pytest.raises(CannotMeasure, match="turn"):
         calibrate_axis(centres(angles, 0.01, np.random.default_rng(2)), np.array(angles, float))

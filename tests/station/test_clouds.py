@@ -239,6 +239,7 @@ def test_a_damaged_pcd_is_refused(tmp_path: Path, content: bytes, what: str) -> 
         "# a scan\n\n1.5,-2.25,3,255\n0.1,0.2,0.3,0\n// middle\n-7,8,9.125,1\n",
         "x,y,z\n1.5, -2.25, 3\n0.1, 0.2, 0.3\n-7, 8, 9.125\n",
         '"X [mm]";"Y [mm]";"Z [mm]"\n1,5;-2,25;3\n0,1;0,2;0,3\n-7;8;9,125\n',
+        "yaw,x_mm,y_mm,z_mm\n9,1.5,-2.25,3\n9,0.1,0.2,0.3\n9,-7,8,9.125\n",
         "id;z;y;x\n1;3;-2,25;1,5\n2;0,3;0,2;0,1\n3;9,125;8;-7\n",
     ],
 )
@@ -256,6 +257,8 @@ def test_text_is_read(text: str) -> None:
         ("1 2 3\n1 2\n", "row"),
         ("1,2,,3\n4,,5,6\n", "could not convert"),
         ("1 2 3\n1 2 three\n", "could not convert"),
+        ("x,yaw,z\n1,2,3\n", "neither numbers nor the names"),
+        ("x,y,z,X\n1,2,3,4\n", "columns 1 and 4 are both called x"),
         ("a b c\n1 2 3\n", "neither numbers nor the names"),
         ("\0\0\0", "not a text file"),
     ],

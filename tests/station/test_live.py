@@ -4,6 +4,7 @@ import asyncio
 import json
 import os
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager
@@ -14,7 +15,7 @@ import pytest
 import pytest_asyncio
 
 from drivers.wire.plc import Ctrl, FaultCode, StatusBits, decode_result
-from station import record
+from station import cell, record
 from station.events import (
     Acknowledge,
     AlarmRaised,
@@ -22,7 +23,9 @@ from station.events import (
     PartRecorded,
     Reset,
     SectionMeasured,
+    Start,
     StationStatus,
+    Stop,
     VerdictAcknowledged,
     VerdictReached,
     ViewCaptured,
@@ -302,6 +305,36 @@ async def test_an_answer_while_the_record_is_read_anew_waits_for_it(
         assert rig.cell.record.request(1).phase == "ACKED"
 
 
+@pytest.mark.parametrize("phase", ["MEASURING", "PUBLISHED"])
+async def test_a_disk_that_stalls_is_a_fault_in_time_and_loses_nothing(
+    station: Stations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
+) -> None:
+    goes_on = threading.Event()
+    monkeypatch.setattr(cell, "DISK_S", 1.0)
+    monkeypatch.setattr(cell, "REOPEN_S", 0.5)
+    async with station(tmp_path) as rig:
+        await rig.plc.until_bits(READY)
+        await rig.plc.ask(1)
+        await rig.plc.until_bits(VALID if phase == "PUBLISHED" else START_ACK | BUSY)
+        await rig.cell.until(lambda: rig.cell.record.request(1).phase != "DECIDED")
+        rig.cell.disk.submit(goes_on.wait, 30.0)
+        if phase == "PUBLISHED":
+            await rig.plc.write(ctrl=UP | Ctrl.RESULT_ACK, ack_sequence=1, ack_code=1)
+        await rig.plc.until_bits(FAULT, BUSY)
+        operator_resets(rig)
+        await rig.cell.until(lambda: rig.cell.state is State.CLEARING)
+        await rig.cell.until(lambda: rig.cell.state is State.ABORTED)  # it stalls still
+        assert rig.cell.record.failed
+        goes_on.set()
+        operator_resets(rig)
+        await rig.plc.until_bits(StatusBits(0), VALID | FAULT)
+        await rig.plc.write(ctrl=UP)
+        await rig.plc.until_bits(READY)
+        expected = ("ACKED", "PASS") if phase == "PUBLISHED" else ("DECIDED", "HOLD")
+        assert (rig.cell.record.request(1).phase, rig.cell.record.request(1).verdict) == expected
+    assert verify(tmp_path / "record") == ()
+
+
 async def delivered(rig: "Rig") -> None:
     await rig.plc.until_bits(READY)
     await rig.plc.ask(1)
@@ -325,6 +358,17 @@ def fail_once(patch: pytest.MonkeyPatch, phase: str) -> None:
 def operator_resets(rig: "Rig") -> None:
     rig.cell.intents.put_nowait(Acknowledge())
     rig.cell.intents.put_nowait(Reset())
+
+
+async def test_a_station_that_waits_says_for_what(rig: "Rig") -> None:
+    rig.cell.intents.put_nowait(Stop())
+    await rig.plc.until_bits(StatusBits(0), READY)
+    await rig.cell.until(lambda: rig.of(StationStatus)[-1].detail == "waits for START")  # type: ignore[union-attr]
+    await rig.plc.write(ctrl=Ctrl.PART_PRESENT)
+    rig.cell.intents.put_nowait(Start())
+    await rig.cell.until(lambda: rig.of(StationStatus)[-1].detail == "waits for ENABLE of the PLC")  # type: ignore[union-attr]
+    await rig.plc.write(ctrl=UP)
+    await rig.plc.until_bits(READY)
 
 
 async def test_a_second_station_finds_the_record_held(rig: "Rig", station: Stations) -> None:

@@ -303,6 +303,14 @@ def test_an_older_copy_of_the_record_is_seen(directory: Path, tmp_path: Path) ->
         opened(directory)
 
 
+@pytest.mark.parametrize("text", ["[]", "{}", "null", '{"entry_no": "1", "hash": 1}', "[" * 100_000, "x"])
+def test_an_anchor_that_names_no_entry_is_one_line(directory: Path, text: str) -> None:
+    (directory / "anchor.json").write_text(text)
+    assert len(verify(directory)) == 1
+    with pytest.raises(RecordBroken, match="anchor"):
+        opened(directory)
+
+
 @pytest.mark.parametrize("content", [b"", b"not a database" * 100])
 def test_a_file_that_is_no_record_is_refused(directory: Path, content: bytes) -> None:
     (directory / "record.sqlite").write_bytes(content)
