@@ -58,6 +58,7 @@ def document(measurement: Measurement, verdict: Verdict, plan: BladePlan, inputs
         "serial": inputs.serial,
         "alignment": alignment_of(measurement.alignment),
         "merge_mm": measurement.merge_mm,
+        "layered_fraction": measurement.layered_fraction,
         "service_motion": service_of(measurement.service),
         "sections": [section_of(section) for section in measurement.sections],
         "blade": blade_of(measurement.line),

@@ -65,6 +65,7 @@ class Acceptance:
     min_runner_up_ratio: float = 1.5
     min_explained_fraction: float = 0.8
     max_noise_ratio: float = 2.0  # of the noise found to the plan's sigma_mm
+    max_layered_fraction: float = 0.002  # of the points; more than a fibre that lies on the blade
 
 
 ACCEPTANCE = Acceptance()
@@ -78,6 +79,10 @@ def alignment_doubts(measurement: Measurement, plan: BladePlan, acceptance: Acce
         return
     for text in pose_doubts(measurement.alignment, acceptance):
         yield Reason(cause=Cause.ALIGNMENT, text=f"alignment: {text}")
+    if not measurement.layered_fraction <= acceptance.max_layered_fraction:
+        percent = 100.0 * measurement.layered_fraction
+        text = f"scan: {percent:.1f} % of its points are a second layer of the skin: did the part move?"
+        yield Reason(cause=Cause.ALIGNMENT, text=text)
     noise_mm, sigma_mm = noise_of(measurement, measurement.alignment, plan), plan.measurement.sigma_mm
     if not noise_mm <= acceptance.max_noise_ratio * sigma_mm:
         text = f"noise: the scan scatters by {noise_mm:.3g} mm, the plan states {sigma_mm:g} mm"

@@ -120,6 +120,7 @@ def measured(cloud: Cloud, recipe: Recipe, run: Run) -> Measurement:
         form_mm=twin.form_mm if twin else NO_TWIN,
         residual_mm=twin.noise_mm if twin else None,
         damages=None if damages is None else with_volumes(damages, repairs),
+        layered_fraction=layered_fraction(damages or (), len(points) if points else 0),
         detection_mm=detection.depth_mm if detection else found.detection_mm,
         detection_mm2=detection.area_mm2 if detection else found.detection_mm2,
         repairs=repairs,
@@ -247,6 +248,11 @@ def unexcused(measured: Measured) -> Measured:
     if isinstance(measured, NotMeasured) and measured.in_damage:
         return NotMeasured(reason=f"{measured.reason}, but no damage was found there")
     return measured
+
+
+def layered_fraction(damages: Sequence[Damage], points: int) -> float:
+    """The share of the scan points that lie on damages where the scan is in layers."""
+    return sum(len(damage.points) for damage in damages if damage.layered) / max(points, 1)
 
 
 def with_volumes(damages: Sequence[Damage], repairs: RepairVolume | None) -> tuple[Damage, ...]:

@@ -44,7 +44,8 @@ class Measurement:
     `aligned_mm` (n, 3) is the cleaned scan in the nominal frame, `deviation_mm` (n,) its signed distance
     to the nominal, positive outside. `detection_mm` is the depth of damage that is surely found in a
     zone, where it covers `detection_mm2`. `residual_mm` is what the twin leaves of the sound points: noise,
-    without the form of the part.
+    without the form of the part. `layered_fraction` is the share of the cleaned points on damages under or
+    over skin that was scanned as well.
     `timing_s` counts the seconds of each step.
     """
 
@@ -61,6 +62,7 @@ class Measurement:
     form_mm: Measured = NO_TWIN
     residual_mm: float | None = None
     damages: tuple[Damage, ...] | None = None
+    layered_fraction: float = 0.0
     detection_mm: Mapping[Zone, Measured] = field(default_factory=dict)
     detection_mm2: Measured = NO_TWIN
     repairs: RepairVolume | None = None

@@ -16,6 +16,7 @@ LIKELY = 0.7  # mean depth of the neighbours, in films, at which a point below t
 CERTAIN = 2.0  # own depth in films that needs no neighbours but two
 NEAR_SKIN_MM = 0.5  # farther off, a point that no damage claims is none of the blade's
 SMOOTH = 0.97  # cosine between break and skin from which on the one runs out into the other
+MIN_PLACES = 3  # of a surface
 SUPPORT = 2.5  # skin farther than this many point spacings from every sound point is lost or unseen
 
 
@@ -75,8 +76,8 @@ def find_broken_surface(
 ) -> BrokenSurface:
     """The broken surface under the points `flagged` as one damage.
 
-    Points on it lie provably below the twin. Raises `CannotRepair` if there are fewer than `min_points`,
-    or if inside cannot be told from outside.
+    Points on it lie provably below the twin. Raises `CannotRepair` if there are fewer than `min_points`, if
+    they lie in fewer than `MIN_PLACES` places, or if inside cannot be told from outside.
     """
     pitch_mm = _spacing(scan.points_mm[flagged])
     near = _points_near(scan, flagged, 3.0 * pitch_mm)
@@ -85,7 +86,10 @@ def find_broken_surface(
         raise CannotRepair(f"{deep.sum()} scan points lie provably below the twin, {min_points} are needed")
     raw_mm, sigma_mm = scan.points_mm[near[deep]], float(np.median(scan.sigma_mm[near[deep]]))
     sound_mm = _sound_points(scan, near[~deep], raw_mm)
-    points_mm, frames, bending = _shape(skin, thinned(raw_mm, 6.0 * sigma_mm), sound_mm, 3.0 * pitch_mm)
+    places_mm = thinned(raw_mm, 6.0 * sigma_mm)
+    if len(places_mm) < MIN_PLACES:
+        raise CannotRepair(f"the {len(raw_mm)} scan points on it crowd in {len(places_mm)} place(s)")
+    points_mm, frames, bending = _shape(skin, places_mm, sound_mm, 3.0 * pitch_mm)
     spacing_mm = spacings_mm(points_mm)
     lost_pitch_mm = _lost_pitch(skin, points_mm, spacing_mm)
     support_mm = min(SUPPORT * pitch_mm, 0.5 * max_gap_mm)

@@ -12,6 +12,7 @@ from geometry.damage.bends import BendSettings, bend_depth, bend_off_nominal, be
 from geometry.damage.depth import EdgeLoss, edge_loss, lowest_mm, reaches_edge, span_depth
 from geometry.damage.detection import PRECEDENCE
 from geometry.damage.excess import excess_volume
+from geometry.damage.layers import in_layers
 from geometry.damage.normal_depth import normal_depth
 from geometry.damage.regions import (
     Field,
@@ -20,6 +21,7 @@ from geometry.damage.regions import (
     find_regions,
     stand_off,
 )
+from geometry.damage.skin import skin_of
 from geometry.deformation.twin import Twin
 from geometry.registration.alignment import Alignment
 from geometry.threads import one_blas_thread
@@ -28,6 +30,7 @@ from geometry.types import Bools, Cloud, Floats, Ints, Measurand, Measured, NotM
 NOT_AN_EDGE = NotMeasured(reason="no loss of an edge")
 NOT_SOUGHT = NotMeasured(reason="was not looked for")
 NOT_BENT = NotMeasured(reason="not bent")
+IN_LAYERS = NotMeasured(reason="the scan shows the skin over it as well")
 ALONE = NotMeasured(reason="no other damage")
 EDGES = (Zone.LEADING_EDGE, Zone.TRAILING_EDGE)
 PROVEN = 2.0  # sigmas of the loss of an edge
@@ -57,6 +60,7 @@ class Damage:
     remaining_chord_mm: Measured = NOT_AN_EDGE  # least, of a section there
     above_root_mm: Measured = NOT_SOUGHT  # its lowest point over z_min
     spacing_mm: Measured = ALONE  # straight to the nearest other damage
+    layered: bool = False  # the scan shows the skin there as well
     off_nominal_mm: Measured = NOT_BENT  # how far bent metal lies off the nominal, which limits of form judge
 
 
@@ -86,9 +90,21 @@ def find_damages(
     found = stand_off(cloud, alignment, nominal, twin, settings.regions)
     regions = find_regions(found, nominal, settings.regions)
     bent, single = bent_pairs(regions, found, nominal, settings.bends)
-    damages = [_described(region, found, nominal, twin, settings) for region in single]
-    damages += [_bent(a, b, found, nominal, alignment, settings) for a, b in bent]
+    damages = [_layered(region, found, nominal, twin, settings) for region in single]
+    damages += [_bent(a, b, found, nominal, twin, alignment, settings) for a, b in bent]
     return _spaced(damages, found)
+
+
+def _layered(region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings) -> Damage:
+    """The damage of a region. Metal that is missing under skin which was scanned as well has no size."""
+    damage = _described(region, found, nominal, twin, settings)
+    if not in_layers(region, found, skin_of(twin.mesh)):
+        return damage
+    if damage.kind is DamageKind.EXCESS:  # a fibre has skin under it
+        return replace(damage, layered=True)
+    return replace(
+        damage, layered=True, depth_mm=IN_LAYERS, volume_mm3=IN_LAYERS, remaining_chord_mm=IN_LAYERS
+    )
 
 
 def _described(
@@ -165,6 +181,7 @@ def _bent(
     excess: Region,
     found: Field,
     nominal: Nominal,
+    twin: Twin,
     alignment: Alignment,
     settings: DamageSettings,
 ) -> Damage:
@@ -182,6 +199,7 @@ def _bent(
         span_mm=_span_mm(both, found),
         centroid_mm=found.scan_mm[points].mean(axis=0),
         points=points,
+        layered=any(in_layers(side, found, skin_of(twin.mesh)) for side in (missing, excess)),
         off_nominal_mm=bend_off_nominal(both, found, nominal, alignment),
     )
 

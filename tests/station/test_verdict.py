@@ -115,6 +115,17 @@ def test_noise_well_above_the_stated_sigma_holds() -> None:
     assert verdict(alignment=noisy, residual_mm=0.02).verdict == Word.PASS  # form, not noise
 
 
+@pytest.mark.parametrize("share", [0.003, 1.0, float("nan")])
+def test_a_scan_in_layers_scraps_no_part(share: float) -> None:
+    scrap = measurement(damages=(damage(depth=20.0),))
+    assert judge(scrap, plan(), GATES).verdict == Word.SCRAP
+    done = judge(replace(scrap, layered_fraction=share), plan(), GATES)
+    assert done.verdict == Word.HOLD
+    assert {reason.cause for reason in done.because} == {Cause.ALIGNMENT}
+    fibre = measurement(layered_fraction=0.001)
+    assert judge(fibre, plan(), GATES).verdict == Word.PASS
+
+
 def test_the_noise_of_a_datum_zone_is_not_that_of_the_scan() -> None:
     rough = measurement(alignment=alignment(method="root", noise_mm=0.01), residual_mm=0.05)
     root = plan(alignment={"method": "root", "datum_z_mm": [6.0, 22.0]})
