@@ -98,7 +98,7 @@ def find_damages(
 def _layered(region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings) -> Damage:
     """The damage of a region. Metal that is missing under skin which was scanned as well has no size."""
     damage = _described(region, found, nominal, twin, settings)
-    if not in_layers(region, found, skin_of(twin.mesh)):
+    if not in_layers(region, found, nominal, skin_of(twin.mesh)):
         return damage
     if damage.kind is DamageKind.EXCESS:  # a fibre has skin under it
         return replace(damage, layered=True)
@@ -199,7 +199,7 @@ def _bent(
         span_mm=_span_mm(both, found),
         centroid_mm=found.scan_mm[points].mean(axis=0),
         points=points,
-        layered=any(in_layers(side, found, skin_of(twin.mesh)) for side in (missing, excess)),
+        layered=any(in_layers(side, found, nominal, skin_of(twin.mesh)) for side in (missing, excess)),
         off_nominal_mm=bend_off_nominal(both, found, nominal, alignment),
     )
 

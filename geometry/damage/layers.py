@@ -7,6 +7,7 @@ moved between two views, or they were merged wrongly.
 import numpy as np
 from scipy.spatial import cKDTree
 
+from geometry.blade.nominal import Nominal
 from geometry.damage.regions import Field, Region
 from geometry.damage.skin import Skin
 from geometry.types import Bools, Floats
@@ -15,12 +16,19 @@ SOUND = 3.0  # sigmas within which a point lies on the skin, and from which on i
 REACH = 2.0  # spacings of the points, round the foot of one, in which the skin is looked for
 ENOUGH = 3  # points of the skin there
 ONE_SIDED = 0.6  # length of the mean direction to them: beside the border of a break it is 2 / pi
+BARE = 0.2  # of the area of a damage's points: so much skin that nothing covers is gone
 MOST = 0.6  # of a damage's points; breaks straight through the metal have up to 0.41, scans in layers 0.63 on
 SAMPLE = 2000  # points of a region that are asked
 
 
-def in_layers(region: Region, found: Field, skin: Skin) -> bool:
-    """Whether the scan shows the skin, all round, at the feet of most of the points of a damage."""
+def in_layers(region: Region, found: Field, nominal: Nominal, skin: Skin) -> bool:
+    """Whether the scan shows the skin, all round, at the feet of most of the points of a damage.
+
+    The bottom of a pit that goes nearly through has its feet on the far side, but leaves bare skin above.
+    """
+    bare_mm2 = float(nominal.samples.area_mm2[region.lost].sum())
+    if bare_mm2 > BARE * len(region.points) * found.spacing_mm**2:
+        return False
     asked = region.points[:: -(-len(region.points) // SAMPLE)]
     feet_mm = skin.closest(found.scan_mm[asked])[1]
     reach_mm = REACH * found.local_mm[asked]
