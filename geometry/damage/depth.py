@@ -12,7 +12,6 @@ from geometry.damage.regions import Field, Region
 from geometry.deformation.twin import Twin
 from geometry.types import Floats, Measurand, Measured, Mesh, NotMeasured, Zone
 
-DEEP = 3.0  # sigmas below the twin at which a single point lies on the break for certain
 PLANE_POINTS = 12  # of the break, whose plane ends it
 PLANE_REACH = 3.0  # spacings that such a plane may be continued beyond them
 BORDER = 0.5  # standard uncertainty of where a break ends, in spacings of its points, at least
@@ -85,17 +84,14 @@ def _bare_mm(end_mm: Floats, found: Field, reach_mm: float) -> float:
 
     The break ends somewhere in such a gap.
     """
-    near = (np.abs(found.scan_mm - end_mm).max(axis=1) <= reach_mm) & (
-        np.abs(found.height_mm) <= DEEP * np.hypot(found.noise_mm, found.sigma_mm)
-    )
+    near = (np.abs(found.scan_mm - end_mm).max(axis=1) <= reach_mm) & ~found.off_skin
     apart_mm = np.linalg.norm(found.scan_mm[near] - end_mm, axis=1)
     return float(np.clip(apart_mm.min(initial=reach_mm) - found.spacing_mm, 0.0, None))
 
 
 def _break(region: Region, found: Field) -> Floats:
     """The points (m, 3) of a region that lie off the twin each by itself and not alone."""
-    sigma_mm = np.hypot(found.noise_mm, found.sigma_mm[region.points])
-    points_mm = found.scan_mm[region.points[np.abs(found.height_mm[region.points]) > DEEP * sigma_mm]]
+    points_mm = found.scan_mm[region.points[found.off_skin[region.points]]]
     if len(points_mm) < PLANE_POINTS:
         return points_mm
     apart_mm = cKDTree(points_mm).query(points_mm, 3)[0][:, 2]

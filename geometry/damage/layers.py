@@ -8,11 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geometry.blade.nominal import Nominal
-from geometry.damage.regions import Field, Region
+from geometry.damage.regions import DEEP, Field, Region
 from geometry.damage.skin import Skin
 from geometry.types import Bools, Floats
 
-SOUND = 3.0  # sigmas within which a point lies on the skin, and from which on it is another layer
 REACH = 2.0  # spacings of the points, round the foot of one, in which the skin is looked for
 ENOUGH = 3  # points of the skin there
 ONE_SIDED = 0.6  # length of the mean direction to them: beside the border of a break it is 2 / pi
@@ -34,7 +33,7 @@ def in_layers(region: Region, found: Field, nominal: Nominal, skin: Skin) -> boo
     reach_mm = REACH * found.local_mm[asked]
     sound = _sound(region, found, feet_mm, float(reach_mm.max()))
     sound_mm, height_mm = found.scan_mm[sound], found.height_mm[sound]
-    apart_mm = SOUND * np.sqrt(2.0) * found.noise_mm
+    apart_mm = DEEP * np.sqrt(2.0) * found.noise_mm
     near = cKDTree(sound_mm).query_ball_point(feet_mm, reach_mm)
     shown = [
         _surrounded(foot_mm, sound_mm[there][np.abs(height_mm[there] - own_mm) > apart_mm])
@@ -46,8 +45,7 @@ def in_layers(region: Region, found: Field, nominal: Nominal, skin: Skin) -> boo
 def _sound(region: Region, found: Field, feet_mm: Floats, reach_mm: float) -> Bools:
     """Which points (n,) lie on the skin near a damage and are not of it."""
     low_mm, high_mm = feet_mm.min(axis=0) - reach_mm, feet_mm.max(axis=0) + reach_mm
-    sound = np.abs(found.height_mm) <= SOUND * np.hypot(found.noise_mm, found.sigma_mm)
-    sound &= ((found.scan_mm >= low_mm) & (found.scan_mm <= high_mm)).all(axis=1)
+    sound = ~found.off_skin & ((found.scan_mm >= low_mm) & (found.scan_mm <= high_mm)).all(axis=1)
     sound[region.points] = False
     return np.asarray(sound)
 

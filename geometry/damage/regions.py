@@ -19,6 +19,7 @@ from geometry.transforms import apply
 from geometry.types import Bools, Cloud, Floats, Ints
 
 SKIN_SPACINGS = 3.0  # skin farther than this many point spacings from every sound point has lost its cover
+DEEP = 3.0  # sigmas off the twin at which a single point lies on a break, or another layer, for certain
 LINK_SPACINGS = 4.0  # longer links than this many point spacings, and than `join_mm`, join nothing
 NONE = np.zeros(0, np.int64)
 
@@ -66,6 +67,11 @@ class Field:
     sigma_mm: Floats  # (n,) of that mean
     on_airfoil: Bools  # (n,) nearest to required surface
     skin_mm: Floats  # (s, 3) the samples of the required surface on the twin
+
+    @property
+    def off_skin(self) -> Bools:
+        """Which points (n,) lie off the twin for certain, each by itself."""
+        return np.asarray(np.abs(self.height_mm) > DEEP * np.hypot(self.noise_mm, self.sigma_mm))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -228,6 +228,18 @@ def eroded_edge_cutter(
     return _column_solid(grid, np.maximum(height, -CHORD_MM / 4), half_mm, n, R, leading_edge_at(z_mm))
 
 
+CUTTERS = {
+    "tip corner": (Zone.TIP, tip_corner_cutter),
+    "small tip corner": (Zone.TIP, lambda: tip_corner_cutter(4.0)),
+    "rough tip corner": (Zone.TIP, lambda: tip_corner_cutter(8.0, 0.8)),
+    "whole tip": (Zone.TIP, tip_cutter),
+    "pit": (Zone.SURFACE, pit_cutter),
+    "shallow dent": (Zone.SURFACE, dent_cutter),
+    "edge nick": (Zone.LEADING_EDGE, edge_nick_cutter),
+    "eroded edge": (Zone.LEADING_EDGE, eroded_edge_cutter),
+}
+
+
 @dataclass(frozen=True)
 class Specimen:
     """A damaged blade, its truth, and its scan in the nominal frame."""

@@ -12,15 +12,6 @@ from geometry.repair.patches import RepairSettings, find_repairs
 from geometry.types import Measurand, NotMeasured, Zone
 from tests.geometry import repair_blades as blades
 
-CUTTERS = {
-    "tip corner": (Zone.TIP, blades.tip_corner_cutter),
-    "whole tip": (Zone.TIP, blades.tip_cutter),
-    "pit": (Zone.SURFACE, blades.pit_cutter),
-    "dent": (Zone.SURFACE, blades.dent_cutter),
-    "nick": (Zone.LEADING_EDGE, blades.edge_nick_cutter),
-    "erosion": (Zone.LEADING_EDGE, blades.eroded_edge_cutter),
-}
-
 
 @cache
 def nominal() -> Nominal:
@@ -57,10 +48,10 @@ def test_what_a_part_that_moved_seems_to_have_lost_has_no_size(share: float, off
             assert isinstance(damage.volume_mm3, NotMeasured)
 
 
-@pytest.mark.parametrize("name", CUTTERS)
+@pytest.mark.parametrize("name", blades.CUTTERS)
 @pytest.mark.parametrize("noise_mm", [0.004, 0.02])
 def test_metal_that_is_gone_has_no_skin_over_it(name: str, noise_mm: float) -> None:
-    zone, cutter = CUTTERS[name]
+    zone, cutter = blades.CUTTERS[name]
     specimen = blades.specimen({zone: cutter()}, noise_mm, np.random.default_rng(1), 60.0)
     found = damages_of(specimen)
     assert isinstance(found[0].depth_mm, Measurand)

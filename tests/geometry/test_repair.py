@@ -24,21 +24,10 @@ from geometry.transforms import apply, exp, inverse, rigid
 from geometry.types import Cloud, Measurand, Mesh, Zone
 from tests.geometry import repair_blades as blades
 
-CUTTERS = {
-    "tip corner": (Zone.TIP, blades.tip_corner_cutter),
-    "small tip corner": (Zone.TIP, lambda: blades.tip_corner_cutter(4.0)),
-    "rough tip corner": (Zone.TIP, lambda: blades.tip_corner_cutter(8.0, 0.8)),
-    "whole tip": (Zone.TIP, blades.tip_cutter),
-    "pit": (Zone.SURFACE, blades.pit_cutter),
-    "shallow dent": (Zone.SURFACE, blades.dent_cutter),
-    "edge nick": (Zone.LEADING_EDGE, blades.edge_nick_cutter),
-    "eroded edge": (Zone.LEADING_EDGE, blades.eroded_edge_cutter),
-}
-
 
 @cache
 def scanned(name: str, noise_mm: float, seed: int = 0) -> blades.Specimen:
-    zone, cutter = CUTTERS[name]
+    zone, cutter = blades.CUTTERS[name]
     return blades.specimen({zone: cutter()}, noise_mm, np.random.default_rng(seed))
 
 
@@ -65,7 +54,7 @@ def edges_of(mesh: Mesh) -> dict[tuple[int, int], int]:
 
 every_case = pytest.mark.parametrize(
     ("name", "noise_mm"),
-    [(name, 0.015) for name in CUTTERS] + [("tip corner", 0.0), ("pit", 0.0), ("shallow dent", 0.0)],
+    [(name, 0.015) for name in blades.CUTTERS] + [("tip corner", 0.0), ("pit", 0.0), ("shallow dent", 0.0)],
 )
 
 
@@ -93,9 +82,9 @@ def test_the_patch_is_a_solid(name: str, noise_mm: float) -> None:
     assert all(count == 1 and edges.get((b, a)) == 1 for (a, b), count in edges.items())
 
 
-@pytest.mark.parametrize("name", CUTTERS)
+@pytest.mark.parametrize("name", blades.CUTTERS)
 def test_the_patch_is_where_the_metal_was(name: str) -> None:
-    zone, cutter = CUTTERS[name]
+    zone, cutter = blades.CUTTERS[name]
     truth = blades.solid_of(blades.blade_mesh()) ^ cutter()
     patch = blades.solid_of(repaired(name, 0.015).mesh)
     beside = (patch - truth).volume() + (truth - patch).volume()
@@ -103,7 +92,7 @@ def test_the_patch_is_where_the_metal_was(name: str) -> None:
     assert repaired(name, 0.015).zone is zone
 
 
-@pytest.mark.parametrize("name", CUTTERS)
+@pytest.mark.parametrize("name", blades.CUTTERS)
 def test_its_outer_skin_is_exactly_the_twin(name: str) -> None:
     specimen, patch = scanned(name, 0.015), repaired(name, 0.015)
     twin = blades.solid_of(specimen.twin.mesh)
@@ -360,7 +349,7 @@ def test_a_patch_is_written_with_its_allowance_and_counted_without(name: str) ->
 
 @pytest.mark.parametrize("name", ["tip corner", "pit"])
 def test_the_area_of_the_lost_skin_is_that_of_the_cut(name: str) -> None:
-    _, cutter = CUTTERS[name]
+    _, cutter = blades.CUTTERS[name]
     whole = blades.solid_of(blades.blade_mesh()).as_original()
     lost = (whole ^ cutter()).to_mesh64()
     skin = np.asarray(lost.run_original_id) == whole.original_id()
