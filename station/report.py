@@ -26,6 +26,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 MAP_HEIGHT_PX = 520
 MAP_POINTS = 120_000
 
+SIDES = {"le": "leading edge", "ss": "suction side", "te": "trailing edge", "ps": "pressure side"}
+
 SENTENCES = {
     "PASS": "Serviceable as it is.",
     "REPAIR": "Beyond serviceable, proven repairable.",
@@ -66,6 +68,7 @@ def render(result: Mapping[str, Any], measurement: Measurement, verdict: Verdict
         result=result,
         sentence=SENTENCES[verdict.verdict.value],
         findings=[f for f in verdict.findings if not f.characteristic.startswith("sections[")],
+        sides=SIDES,
         sections=pages(measurement, verdict, plan),
         map=deviation_map(measurement, plan),
         damages=measurement.damages or (),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from geometry.sections.profile import ZoneArc
 from geometry.transforms import about_z, apply, rigid
 from geometry.types import Zone
 from station.document import Inputs, document, document_text
@@ -394,6 +395,24 @@ def test_every_outcome_has_a_report_that_needs_nothing_else(given: Measurement) 
     assert word in "".join(reader.text)
     assert all(address == "" or address.startswith("data:image/png;base64,") for address in reader.addresses)
     assert "non-destructive testing" in "".join(reader.text)
+
+
+def test_the_report_tells_how_a_patch_meets_the_sound_skin() -> None:
+    met = replace(patch(0), border_angle_deg=number("border_angle_deg", 7.3))
+    text = "".join(report(replace(broken(), repairs=repairs(met))).text)
+    assert "7.3" in text
+    assert "7.3" not in "".join(report(broken()).text)
+
+
+def test_the_report_tells_how_well_each_side_of_a_section_was_seen() -> None:
+    arcs = {"le": (0.91, 0.0), "ss": (1.0, 0.12), "te": (0.5, 3.21), "ps": (0.99, 0.4)}
+    seen = {side: ZoneArc(covered_fraction=part, largest_gap_mm=gap) for side, (part, gap) in arcs.items()}
+    text = " ".join("".join(report(measurement(sections=(replace(section(), zones=seen),))).text).split())
+    assert (
+        "Arc with points, and the largest gap: leading edge 91.0 %, 0.00 mm; suction side 100.0 %, 0.12 mm; "
+        "trailing edge 50.0 %, 3.21 mm; pressure side 99.0 %, 0.40 mm."
+    ) in text
+    assert "largest gap:" not in "".join(report(measurement()).text)
 
 
 def test_a_serial_number_cannot_become_markup() -> None:
