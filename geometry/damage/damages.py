@@ -31,6 +31,7 @@ NOT_AN_EDGE = NotMeasured(reason="no loss of an edge")
 NOT_SOUGHT = NotMeasured(reason="was not looked for")
 NOT_BENT = NotMeasured(reason="not bent")
 IN_LAYERS = NotMeasured(reason="the scan shows the skin over it as well")
+SIZELESS = EdgeLoss(depth_mm=IN_LAYERS, remaining_chord_mm=IN_LAYERS)
 ALONE = NotMeasured(reason="no other damage")
 EDGES = (Zone.LEADING_EDGE, Zone.TRAILING_EDGE)
 PROVEN = 2.0  # sigmas of the loss of an edge
@@ -90,42 +91,32 @@ def find_damages(
     found = stand_off(cloud, alignment, nominal, twin, settings.regions)
     regions = find_regions(found, nominal, settings.regions)
     bent, single = bent_pairs(regions, found, nominal, settings.bends)
-    damages = [_layered(region, found, nominal, twin, settings) for region in single]
+    damages = [_single(region, found, nominal, twin, settings) for region in single]
     damages += [_bent(a, b, found, nominal, twin, alignment, settings) for a, b in bent]
     return _spaced(damages, found)
 
 
-def _layered(region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings) -> Damage:
+def _single(region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings) -> Damage:
     """The damage of a region. Metal that is missing under skin which was scanned as well has no size."""
-    damage = _described(region, found, nominal, twin, settings)
-    if not in_layers(region, found, nominal, skin_of(twin.mesh)):
-        return damage
-    if damage.kind is DamageKind.EXCESS:  # a fibre has skin under it
-        return replace(damage, layered=True)
-    return replace(
-        damage, layered=True, depth_mm=IN_LAYERS, volume_mm3=IN_LAYERS, remaining_chord_mm=IN_LAYERS
-    )
-
-
-def _described(
-    region: Region, found: Field, nominal: Nominal, twin: Twin, settings: DamageSettings
-) -> Damage:
     body_mm = np.concatenate([found.scan_mm[region.points], found.skin_mm[region.lost]])
     zone = _zone(region, found, nominal, settings.touching)
     lowest = lowest_mm(region, found, twin)
-    loss = _loss(region, found, nominal, twin, zone, lowest)
+    layered = in_layers(region, found, nominal, skin_of(twin.mesh))
+    sizeless = layered and region.missing  # under a fibre there is skin
+    loss = SIZELESS if sizeless else _loss(region, found, nominal, twin, zone, lowest)
     return Damage(
         zone=zone,
         kind=DamageKind.MISSING if region.missing else DamageKind.EXCESS,
         depth_mm=loss.depth_mm,
         area_mm2=_area(region, found, nominal),
-        volume_mm3=_volume(region, found, twin, settings),
+        volume_mm3=IN_LAYERS if sizeless else _volume(region, found, twin, settings),
         length_mm=_length_mm(body_mm),
         span_mm=_span_mm(region, found),
         centroid_mm=body_mm.mean(axis=0),
         points=region.points,
         remaining_chord_mm=loss.remaining_chord_mm,
         above_root_mm=_above_root(lowest, nominal),
+        layered=layered,
     )
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from geometry.blade.solid import volume_mm3
 from geometry.damage.broken import BrokenSurface, Scan, find_broken_surface
-from geometry.damage.damages import Damage, DamageKind
+from geometry.damage.damages import IN_LAYERS, Damage, DamageKind
 from geometry.damage.depth import BORDER
 from geometry.damage.skin import Skin, skin_of
 from geometry.deformation.twin import Twin
@@ -98,10 +98,14 @@ class RepairVolume:
 def find_repairs(
     twin: Twin, cloud: Cloud, alignment: Alignment, damages: Sequence[Damage], settings: RepairSettings
 ) -> RepairVolume:
-    """One patch, or the reason why there is none, for each damage with missing metal."""
+    """One patch, or the reason why there is none, for each damage with missing metal.
+
+    Metal whose skin was scanned as well is not known to be missing: it gets none.
+    """
     missing = [i for i, damage in enumerate(damages) if damage.kind is DamageKind.MISSING]
     patches: list[Patch] = []
-    failures: dict[int, str] = {}
+    failures = {i: IN_LAYERS.reason for i in missing if damages[i].layered}
+    missing = [i for i in missing if i not in failures]
     if missing:
         skin, solid = skin_of(twin.mesh), solid_of(twin.mesh).as_original()
         scan = _scan(twin, cloud, alignment, damages)

@@ -58,6 +58,24 @@ def test_metal_that_is_gone_has_no_skin_over_it(name: str, noise_mm: float) -> N
     assert not any(damage.layered for damage in found)
 
 
+def test_a_side_that_was_seen_twice_has_lost_nothing() -> None:
+    whole = blades.specimen({}, 0.01, np.random.default_rng(3), 60.0)
+    points_mm = whole.cloud.points_mm
+    late = np.random.default_rng(4).random(len(points_mm)) < 0.25
+    late &= (np.abs(points_mm[:, 2] - 25.0) < 10.0) & (points_mm[:, 1] > np.median(points_mm[:, 1]))
+    cloud = replace(whole.cloud, points_mm=points_mm - late[:, None] * np.array([0.05, 0.25, 0.0]))
+    twin = blades.twin_of(whole.twin.mesh, ~late, 0.01)
+    found = damages_of(replace(whole, cloud=cloud, twin=twin))
+    assert found[0].kind is DamageKind.MISSING
+    assert len(found[0].points) > 1000
+    assert found[0].layered
+    assert isinstance(found[0].depth_mm, NotMeasured)
+    assert isinstance(found[0].volume_mm3, NotMeasured)
+    repairs = find_repairs(twin, cloud, whole.alignment, found, RepairSettings())
+    assert not repairs.patches
+    assert "shows the skin" in repairs.failures[0]
+
+
 def test_points_that_crowd_in_one_place_are_no_broken_surface() -> None:
     whole = blades.specimen({}, 0.004, np.random.default_rng(2), 60.0)
     at_mm, normal = blades.suction_side_at(0.5, 20.0)
